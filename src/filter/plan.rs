@@ -1,0 +1,52 @@
+//! What a tile will cost, as a function of its shape, before any of it is allocated.
+
+use super::{ChannelSet, Method, TileGeometry, method::Algorithm};
+
+/// The shape of a tile's samples, as its header announces it.
+#[derive(Clone, Copy, Debug)]
+pub struct Shape<'a> {
+    /// Where the tile lies.
+    pub geometry: &'a TileGeometry,
+    /// Its channels.
+    pub channels: &'a ChannelSet,
+    /// Samples in the data window.
+    pub samples: u64,
+    /// Greatest number of samples in any pixel, or an upper bound.
+    pub max_per_pixel: u32,
+    /// Whether the pixels may have different numbers of samples.
+    pub varying: bool,
+}
+
+/// Bytes that a tile needs: upper bounds, each at most a quarter above what is really allocated when every plane is
+/// spelt out and `max_per_pixel` is exact.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Plan {
+    /// The samples themselves.
+    pub samples: u64,
+    /// What the method keeps beside them for the whole tile.
+    pub working: u64,
+    /// What the method needs on each thread.
+    pub per_thread: u64,
+    /// The filtered core.
+    pub output: u64,
+}
+
+impl Plan {
+    /// All of it, on so many threads.
+    pub const fn total(&self, threads: usize) -> u64 {
+        self.samples + self.working + self.output + self.per_thread * threads as u64
+    }
+}
+
+/// Bytes that filtering a tile of this shape will need.
+pub fn plan(shape: &Shape, method: &Method) -> Plan {
+    let pixels = shape.geometry.window().area();
+    // 4 bytes a value; where counts vary, a start and, while it is read, a count per pixel.
+    let starts = if shape.varying { pixels * (4 + 2) + 4 } else { 0 };
+    let samples = shape.samples * 4 * shape.channels.planes() as u64 + starts;
+    let output = shape.geometry.core().area() * 12;
+    match method.algorithm() {
+        Algorithm::Unfiltered => Plan { samples, working: 0, per_thread: 0, output },
+        Algorithm::Rpf(_) => Plan { samples, working: 0, per_thread: 0, output },
+    }
+}

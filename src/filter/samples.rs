@@ -1,0 +1,437 @@
+//! The samples of one tile: a planar store, `[plane][pixel][sample]`, of its data window.
+//!
+//! A *channel* is what a renderer calls by one name (colour, a feature, a random parameter) and has 1 to 4 components;
+//! each component is a *plane* of `f32`, and every plane has one value per sample. Pixels are in row-major order, the
+//! samples of a pixel next to each other. A plane whose values are all equal is kept as that one value.
+
+use super::geometry::TileGeometry;
+
+/// Most planes a tile may have: components of all channels together.
+pub const MAX_PLANES: usize = 256;
+/// Most samples a pixel may have.
+pub const MAX_SAMPLES_PER_PIXEL: u32 = u16::MAX as u32;
+/// Most samples a tile may have: positions in a plane are kept in 32 bits.
+pub const MAX_SAMPLES: u64 = u32::MAX as u64;
+
+/// What a channel's values mean to the filter.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Role {
+    /// Position on the film in continuous image coordinates (pixel (x, y) covers x..x+1), 2 components.
+    Film,
+    /// Linear radiance R, G, B, 3 components.
+    Color,
+    /// A scene feature; NaN where a sample has none.
+    Feature {
+        /// Whether this is a world-space position, which clusters more loosely.
+        position: bool,
+    },
+    /// A random parameter of the renderer.
+    Random {
+        /// Whether these are the uniform numbers in [0, 1) as drawn, not something derived from them.
+        uniform: bool,
+    },
+}
+
+/// One named channel.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct Channel {
+    /// Unique in its tile, 1 to 255 bytes.
+    pub name: String,
+    /// What the values mean.
+    pub role: Role,
+    /// Number of planes, 1 to 4; a colour has 3, a film position 2.
+    pub components: u32,
+}
+
+impl Channel {
+    /// A channel; [`ChannelSet::new`] checks it.
+    pub fn new(name: impl Into<String>, role: Role, components: u32) -> Self {
+        Self { name: name.into(), role, components }
+    }
+}
+
+/// Channels that cannot be; says what would be right.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ChannelError {
+    /// A name is empty or too long.
+    #[error("channel {0:?}: a name must have 1 to 255 bytes")]
+    Name(String),
+    /// Two channels share a name.
+    #[error("channel {0:?} is announced twice: names must be unique")]
+    Repeated(String),
+    /// A component count that the role does not allow.
+    #[error("channel {name:?} has {components} components: {right}")]
+    Components {
+        /// The channel.
+        name: String,
+        /// What it announced.
+        components: u32,
+        /// What would be right.
+        right: &'static str,
+    },
+    /// No colour, or more than one.
+    #[error("{0} channels have the role color: there must be exactly one")]
+    Color(usize),
+    /// More than one film position.
+    #[error("{0} channels have the role film: there may be one")]
+    Film(usize),
+    /// Too many planes.
+    #[error("the channels have {0} components in all: at most {MAX_PLANES} are allowed")]
+    TooMany(u64),
+}
+
+/// The channels of a tile, checked: one colour, at most one film position, unique names.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct ChannelSet {
+    channels: Vec<Channel>,
+}
+
+impl ChannelSet {
+    /// Checks the channels; their order is the order of the planes.
+    pub fn new(channels: Vec<Channel>) -> Result<Self, ChannelError> {
+        let mut names = std::collections::HashSet::new();
+        for channel in &channels {
+            let Channel { name, role, components } = channel;
+            if name.is_empty() || name.len() > 255 {
+                return Err(ChannelError::Name(name.clone()));
+            }
+            if !names.insert(name.as_str()) {
+                return Err(ChannelError::Repeated(name.clone()));
+            }
+            let right = match role {
+                Role::Color if *components != 3 => "a color has 3",
+                Role::Film if *components != 2 => "a film position has 2",
+                _ if !(1..=4).contains(components) => "1 to 4 are allowed",
+                _ => continue,
+            };
+            return Err(ChannelError::Components { name: name.clone(), components: *components, right });
+        }
+        let count = |role: Role| channels.iter().filter(|c| c.role == role).count();
+        if count(Role::Color) != 1 {
+            return Err(ChannelError::Color(count(Role::Color)));
+        }
+        if count(Role::Film) > 1 {
+            return Err(ChannelError::Film(count(Role::Film)));
+        }
+        let planes: u64 = channels.iter().map(|c| u64::from(c.components)).sum();
+        if planes > MAX_PLANES as u64 {
+            return Err(ChannelError::TooMany(planes));
+        }
+        Ok(Self { channels })
+    }
+
+    /// The channels in plane order.
+    pub fn channels(&self) -> &[Channel] {
+        &self.channels
+    }
+
+    /// Number of planes: components of all channels together.
+    pub fn planes(&self) -> usize {
+        self.channels.iter().map(|c| c.components as usize).sum()
+    }
+
+    /// The channel, and the component in it, of every plane in order.
+    pub fn plane_channels(&self) -> impl Iterator<Item = (&Channel, u32)> {
+        self.channels.iter().flat_map(|channel| (0..channel.components).map(move |component| (channel, component)))
+    }
+
+    /// Indices of the planes whose channel passes `wanted`, in plane order.
+    pub fn planes_of(&self, wanted: impl Fn(&Role) -> bool) -> Vec<usize> {
+        self.plane_channels().enumerate().filter(|(_, (c, _))| wanted(&c.role)).map(|(plane, _)| plane).collect()
+    }
+
+    /// The three colour planes R, G, B.
+    pub fn color_planes(&self) -> [usize; 3] {
+        let first = self.plane_channels().position(|(c, _)| c.role == Role::Color).unwrap_or(0);
+        [first, first + 1, first + 2]
+    }
+
+    /// A name for a plane: the channel's name, with the component's number where there are several (`P.1`).
+    pub fn plane_name(&self, plane: usize) -> String {
+        match self.plane_channels().nth(plane) {
+            Some((channel, _)) if channel.components == 1 => channel.name.clone(),
+            Some((channel, component)) => format!("{}.{component}", channel.name),
+            None => format!("#{plane}"),
+        }
+    }
+}
+
+/// How many samples each pixel of the data window has.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Counts {
+    /// The same number in each.
+    Uniform(u32),
+    /// One number per pixel, row-major; 0 is allowed.
+    Varying(Vec<u16>),
+}
+
+/// One plane's values, as they come in.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Plane {
+    /// Every sample has this value.
+    Constant(f32),
+    /// One value per sample.
+    Values(Vec<f32>),
+}
+
+/// Values that were not finite where they must be, and what they became.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Replaced {
+    /// Colour values set to the mean of their pixel's finite samples, or 0.
+    pub color: u64,
+    /// Infinite features set to 0 (NaN is a missing feature and stays).
+    pub feature: u64,
+    /// Random parameters set to 0.
+    pub random: u64,
+    /// Film positions set to 0.
+    pub film: u64,
+}
+
+impl Replaced {
+    /// All of them.
+    pub const fn total(&self) -> u64 {
+        self.color + self.feature + self.random + self.film
+    }
+}
+
+/// Samples that do not fit their shape; says what would be right.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum SampleError {
+    /// The number of counts is not the number of pixels.
+    #[error("{got} sample counts for a data window of {pixels} pixels: there must be one each")]
+    Counts {
+        /// Counts given.
+        got: usize,
+        /// Pixels in the data window.
+        pixels: u64,
+    },
+    /// The number of planes is not what the channels announce.
+    #[error("{got} planes where the channels announce {expected}")]
+    Planes {
+        /// Planes given.
+        got: usize,
+        /// Planes announced.
+        expected: usize,
+    },
+    /// A plane has a wrong number of values.
+    #[error("plane {plane} has {got} values: the data window has {expected} samples")]
+    Length {
+        /// The plane's name.
+        plane: String,
+        /// Values given.
+        got: usize,
+        /// Samples in the data window.
+        expected: u64,
+    },
+    /// More samples in a pixel than may be.
+    #[error("{0} samples per pixel: at most {MAX_SAMPLES_PER_PIXEL} are allowed")]
+    PerPixel(u32),
+    /// More samples in the tile than may be.
+    #[error("{0} samples in one tile: at most {MAX_SAMPLES} are allowed; send smaller tiles")]
+    TooMany(u64),
+}
+
+/// The samples of one tile, checked and made finite.
+///
+/// After construction every value is finite, except features, where NaN says that a sample has none; negative zeros
+/// have become zeros, and planes of equal values are [`Plane::Constant`].
+#[derive(Clone, Debug)]
+pub struct SampleTile {
+    geometry: TileGeometry,
+    channels: ChannelSet,
+    layout: SampleLayout,
+    planes: Vec<Plane>,
+    replaced: Replaced,
+}
+
+/// Where each pixel's samples lie in a plane.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum SampleLayout {
+    /// So many samples in each of the pixels.
+    Uniform { per_pixel: u32, pixels: u32 },
+    /// Pixel i has the samples `starts[i]..starts[i + 1]`.
+    Varying { starts: Vec<u32> },
+}
+
+impl SampleLayout {
+    /// The samples of a pixel, by its row-major index in the data window.
+    #[inline(always)]
+    pub(crate) fn of(&self, pixel: usize) -> std::ops::Range<usize> {
+        match self {
+            Self::Uniform { per_pixel, .. } => pixel * *per_pixel as usize..(pixel + 1) * *per_pixel as usize,
+            Self::Varying { starts } => starts[pixel] as usize..starts[pixel + 1] as usize,
+        }
+    }
+
+    /// Number of samples in all.
+    pub(crate) fn total(&self) -> usize {
+        match self {
+            Self::Uniform { per_pixel, pixels } => *per_pixel as usize * *pixels as usize,
+            Self::Varying { starts } => starts.last().copied().unwrap_or(0) as usize,
+        }
+    }
+}
+
+/// Number of samples in a data window of so many pixels, checked against the limits.
+pub fn sample_total(pixels: u64, counts: &Counts) -> Result<u64, SampleError> {
+    let total = match counts {
+        Counts::Uniform(n) if *n > MAX_SAMPLES_PER_PIXEL => return Err(SampleError::PerPixel(*n)),
+        Counts::Uniform(n) => pixels.checked_mul(u64::from(*n)).ok_or(SampleError::TooMany(u64::MAX))?,
+        Counts::Varying(counts) => {
+            if counts.len() as u64 != pixels {
+                return Err(SampleError::Counts { got: counts.len(), pixels });
+            }
+            counts.iter().map(|&n| u64::from(n)).sum()
+        }
+    };
+    if total > MAX_SAMPLES || pixels > MAX_SAMPLES { Err(SampleError::TooMany(total.max(pixels))) } else { Ok(total) }
+}
+
+impl SampleTile {
+    /// Checks the shape and makes the values finite, in place: a colour that is not finite becomes the mean of its
+    /// pixel's finite samples in that channel (0 if there is none); NaN in a feature stays and means "none"; anything
+    /// else that is not finite becomes 0.
+    ///
+    /// `planes` are in the order of [`ChannelSet::plane_channels`], each with one value per sample of the data window.
+    pub fn new(
+        geometry: TileGeometry,
+        channels: ChannelSet,
+        counts: Counts,
+        planes: Vec<Plane>,
+    ) -> Result<Self, SampleError> {
+        let pixels = geometry.window().area();
+        let total = sample_total(pixels, &counts)?;
+        if planes.len() != channels.planes() {
+            return Err(SampleError::Planes { got: planes.len(), expected: channels.planes() });
+        }
+        for (index, plane) in planes.iter().enumerate() {
+            if let Plane::Values(values) = plane
+                && values.len() as u64 != total
+            {
+                let plane = channels.plane_name(index);
+                return Err(SampleError::Length { plane, got: values.len(), expected: total });
+            }
+        }
+        let layout = match counts {
+            Counts::Uniform(per_pixel) => SampleLayout::Uniform { per_pixel, pixels: pixels as u32 },
+            Counts::Varying(counts) => {
+                let mut starts = Vec::with_capacity(counts.len() + 1);
+                starts.push(0);
+                let mut end = 0;
+                starts.extend(counts.iter().map(|&n| {
+                    end += u32::from(n);
+                    end
+                }));
+                SampleLayout::Varying { starts }
+            }
+        };
+        let mut tile = Self { geometry, channels, layout, planes, replaced: Replaced::default() };
+        tile.sanitise();
+        Ok(tile)
+    }
+
+    fn sanitise(&mut self) {
+        let roles: Vec<Role> = self.channels.plane_channels().map(|(channel, _)| channel.role).collect();
+        for (plane, role) in self.planes.iter_mut().zip(roles) {
+            let mut constant = [0.0];
+            let (values, single) = match plane {
+                Plane::Constant(value) => {
+                    constant[0] = *value;
+                    (&mut constant[..], true)
+                }
+                Plane::Values(values) => (&mut values[..], false),
+            };
+            let bad = |v: f32| !v.is_finite() && !(v.is_nan() && matches!(role, Role::Feature { .. }));
+            let mut replaced = values.iter().filter(|&&v| bad(v)).count() as u64;
+            if replaced > 0 {
+                if role == Role::Color && !single {
+                    for pixel in 0..self.geometry.window().area() as usize {
+                        replace_by_mean(&mut values[self.layout.of(pixel)]);
+                    }
+                } else {
+                    values.iter_mut().filter(|v| bad(**v)).for_each(|v| *v = 0.0);
+                }
+                if single {
+                    replaced = self.layout.total() as u64;
+                }
+            }
+            match role {
+                Role::Color => self.replaced.color += replaced,
+                Role::Feature { .. } => self.replaced.feature += replaced,
+                Role::Random { .. } => self.replaced.random += replaced,
+                Role::Film => self.replaced.film += replaced,
+            }
+            // -0 and 0 are equal, and which of them a tile meets first must not matter.
+            values.iter_mut().for_each(|v| *v += 0.0);
+            let same = |v: f32| v == values[0] || (v.is_nan() && values[0].is_nan());
+            if single || values.is_empty() || values.iter().all(|&v| same(v)) {
+                *plane = Plane::Constant(values.first().copied().unwrap_or(0.0));
+            }
+        }
+    }
+
+    /// Where the tile lies.
+    pub const fn geometry(&self) -> &TileGeometry {
+        &self.geometry
+    }
+
+    /// The channels, in plane order.
+    pub const fn channels(&self) -> &ChannelSet {
+        &self.channels
+    }
+
+    /// One plane's values; `plane` is below [`ChannelSet::planes`].
+    pub fn plane(&self, plane: usize) -> &Plane {
+        &self.planes[plane]
+    }
+
+    /// Value of one sample (its position in the plane) in one plane.
+    #[inline(always)]
+    pub fn value(&self, plane: usize, sample: usize) -> f32 {
+        match &self.planes[plane] {
+            Plane::Constant(value) => *value,
+            Plane::Values(values) => values[sample],
+        }
+    }
+
+    /// The samples of a pixel, by its row-major index in the data window: a range of positions in each plane.
+    pub fn samples_of(&self, pixel: usize) -> std::ops::Range<usize> {
+        self.layout.of(pixel)
+    }
+
+    /// Whether the pixels may have different numbers of samples.
+    pub const fn varying(&self) -> bool {
+        matches!(self.layout, SampleLayout::Varying { .. })
+    }
+
+    /// Number of samples in the data window.
+    pub fn total(&self) -> usize {
+        self.layout.total()
+    }
+
+    /// Greatest number of samples in any pixel of the data window.
+    pub fn max_per_pixel(&self) -> u32 {
+        match &self.layout {
+            SampleLayout::Uniform { per_pixel, .. } => *per_pixel,
+            SampleLayout::Varying { starts } => starts.windows(2).map(|w| w[1] - w[0]).max().unwrap_or(0),
+        }
+    }
+
+    /// What had to be made finite.
+    pub const fn replaced(&self) -> Replaced {
+        self.replaced
+    }
+}
+
+/// Replaces what is not finite by the mean of what is, or by 0.
+fn replace_by_mean(samples: &mut [f32]) {
+    let finite = samples.iter().filter(|v| v.is_finite());
+    let count = finite.clone().count();
+    if count < samples.len() {
+        let sum: f64 = finite.map(|&v| f64::from(v)).sum();
+        let mean = if count == 0 { 0.0 } else { (sum / count as f64) as f32 };
+        samples.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = mean);
+    }
+}

@@ -1,0 +1,2 @@
+//! The `rpfd` command.
+fn main() {}
