@@ -1,6 +1,6 @@
 //! A small analytic path tracer: per-sample renders of any size, for tests, benchmarks and the command line.
 //!
-//! It is a real renderer: spheres, planes, rectangles and boxes; Lambertian and rough glossy surfaces; area lights,
+//! It is a real renderer: spheres, rectangles and boxes; Lambertian and rough glossy surfaces; area lights,
 //! sampled with multiple importance sampling; solid textures; a thin lens; linear motion while the shutter is open; box
 //! filter; paths of fixed greatest length without Russian roulette. Its samples are unbiased: the means of ever more of
 //! them tend to what [`Scene::reference`] computes from independent random numbers.

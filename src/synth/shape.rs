@@ -19,8 +19,6 @@ pub(super) const NEAREST: f64 = 1e-7;
 pub(super) enum Shape {
     /// All points at `radius` from `center`; its outside is its front.
     Sphere { center: Vec3, radius: f64 },
-    /// Infinite plane through `point`; its front is where the unit vector `normal` points.
-    Plane { point: Vec3, normal: Vec3 },
     /// Rectangle; `u_inverse` and `v_inverse` are its edges over their squared lengths.
     Rectangle { corner: Vec3, u: Vec3, v: Vec3, u_inverse: Vec3, v_inverse: Vec3, normal: Vec3 },
     /// Box along the axes.
@@ -48,9 +46,6 @@ impl Shape {
                 }
                 let root = discriminant.sqrt();
                 [-b - root, -b + root].into_iter().find(|&t| inside(t))
-            }
-            Self::Plane { point, normal } => {
-                Some((point - origin).dot(normal) / normal.dot(direction)).filter(|&t| inside(t))
             }
             Self::Rectangle { corner, u_inverse, v_inverse, normal, .. } => {
                 let t = (corner - origin).dot(normal) / normal.dot(direction);
@@ -80,7 +75,7 @@ impl Shape {
     pub(super) fn normal(&self, at: Vec3) -> Vec3 {
         match *self {
             Self::Sphere { center, radius } => (at - center) * (1.0 / radius),
-            Self::Plane { normal, .. } | Self::Rectangle { normal, .. } => normal,
+            Self::Rectangle { normal, .. } => normal,
             Self::Block { low, high } => {
                 let (center, size) = ((low + high) * 0.5, high - low);
                 let place = vec3((at.x - center.x) / size.x, (at.y - center.y) / size.y, (at.z - center.z) / size.z);
@@ -101,7 +96,7 @@ impl Shape {
         match *self {
             Self::Sphere { radius, .. } => 4.0 * PI * radius * radius,
             Self::Rectangle { u, v, .. } => u.length() * v.length(),
-            Self::Plane { .. } | Self::Block { .. } => 0.0,
+            Self::Block { .. } => 0.0,
         }
     }
 
@@ -116,7 +111,7 @@ impl Shape {
                 Some((center + normal * radius, normal))
             }
             Self::Rectangle { corner, u, v, normal, .. } => Some((corner + u * a + v * b, normal)),
-            Self::Plane { .. } | Self::Block { .. } => None,
+            Self::Block { .. } => None,
         }
     }
 }
@@ -131,9 +126,8 @@ mod tests {
         let down = ray(vec3(0.2, 5.0, 0.1), vec3(0.0, -1.0, 0.0));
         let block = Shape::Block { low: vec3(-1.0, 0.0, -1.0), high: vec3(1.0, 2.0, 1.0) };
         let rectangle = Shape::rectangle(vec3(-1.0, 3.0, -1.0), vec3(0.0, 0.0, 2.0), vec3(2.0, 0.0, 0.0));
-        let plane = Shape::Plane { point: Vec3::ZERO, normal: vec3(0.0, 1.0, 0.0) };
         let sphere = Shape::Sphere { center: vec3(0.2, 1.0, 0.1), radius: 0.5 };
-        for (shape, distance) in [(block, 3.0), (rectangle, 2.0), (plane, 5.0), (sphere, 3.5)] {
+        for (shape, distance) in [(block, 3.0), (rectangle, 2.0), (sphere, 3.5)] {
             let t = shape.intersect(&down, f64::INFINITY).unwrap();
             assert!((t - distance).abs() < 1e-12, "{shape:?}: {t}");
             assert_eq!(shape.normal(down.origin + down.direction * t), vec3(0.0, 1.0, 0.0));
