@@ -29,12 +29,15 @@
 
 pub mod baseline;
 pub mod geometry;
+mod lanes;
 pub mod method;
+pub mod oracle;
 pub mod plan;
 pub mod rpf;
 pub mod samples;
 
 pub use geometry::{Halo, Rect, TileGeometry};
+pub use lanes::SimdLevel;
 pub use method::{Method, ParameterError};
 pub use samples::{Channel, ChannelSet, Counts, Plane, Role, SampleTile};
 
@@ -49,6 +52,8 @@ pub struct Execution<'a> {
     pub pool: Option<&'a rayon::ThreadPool>,
     /// Work ends soon after this becomes true.
     pub stop: Option<&'a AtomicBool>,
+    /// SIMD instructions to use; the best there are by default. The bits of the result do not depend on it.
+    pub simd: SimdLevel,
     /// Called from any thread with the share of the work that is done, 0 to 1, now and then.
     pub progress: Option<&'a (dyn Fn(f32) + Sync)>,
 }
@@ -147,6 +152,6 @@ impl LeftOutReason {
 pub fn filter(tile: &SampleTile, method: &Method, execution: &Execution) -> Result<Filtered, Stopped> {
     match method.algorithm() {
         method::Algorithm::Unfiltered => baseline::mean::filter(tile, execution),
-        method::Algorithm::Rpf(_) => baseline::mean::filter(tile, execution),
+        method::Algorithm::Rpf(params) => rpf::filter(tile, params, execution),
     }
 }

@@ -19,7 +19,7 @@ pub struct Shape<'a> {
 
 /// Bytes that a tile needs: upper bounds, each at most a quarter above what is really allocated when every plane is
 /// spelt out and `max_per_pixel` is exact.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Plan {
     /// The samples themselves.
     pub samples: u64,
@@ -45,8 +45,9 @@ pub fn plan(shape: &Shape, method: &Method) -> Plan {
     let starts = if shape.varying { pixels * (4 + 2) + 4 } else { 0 };
     let samples = shape.samples * 4 * shape.channels.planes() as u64 + starts;
     let output = shape.geometry.core().area() * 12;
-    match method.algorithm() {
-        Algorithm::Unfiltered => Plan { samples, working: 0, per_thread: 0, output },
-        Algorithm::Rpf(_) => Plan { samples, working: 0, per_thread: 0, output },
-    }
+    let own = match method.algorithm() {
+        Algorithm::Unfiltered => Plan::default(),
+        Algorithm::Rpf(params) => super::rpf::plan(shape, params),
+    };
+    Plan { samples, output, ..own }
 }

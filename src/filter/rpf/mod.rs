@@ -1,5 +1,235 @@
 //! Random Parameter Filtering, one file per part of the algorithm.
+//!
+//! | step | file |
+//! |---|---|
+//! | 1 neighbourhood | [`neighborhood`] |
+//! | 2 normalising | [`statistics`] |
+//! | 3 dependencies | [`information`] |
+//! | 4 weights | [`weights`], [`grid`] |
+//! | 5 filter | [`bilateral`] |
+//! | 6 spikes | [`spikes`] |
+//! | iterations | [`iteration`], and this file |
 
+mod bilateral;
+mod grid;
+mod information;
+mod iteration;
+mod neighborhood;
 pub mod params;
+mod random;
+mod relevance;
+mod spikes;
+mod statistics;
+mod weights;
 
 pub use params::Params;
+
+use super::lanes::dispatch;
+use super::plan::{Plan, Shape};
+use super::{Execution, Filtered, Plane, Rect, Report, SampleTile, Stopped, TileGeometry};
+use grid::Grid;
+use iteration::{Pass, Scratch};
+use relevance::Relevant;
+use std::sync::Mutex;
+
+/// Rows of pixels that a thread takes at a time.
+const BAND: u32 = 8;
+
+/// What iteration `t` has to compute: what later ones read, inside the data window.
+fn region(geometry: &TileGeometry, params: &Params, varying: bool, t: usize) -> Rect {
+    let later: u32 = (t + 1..params.boxes.len()).map(|t| params.reach_of(t)).sum();
+    geometry.core().grown(later + if varying { params.fill_reach() } else { 0 }, &geometry.window())
+}
+
+/// Bytes for the method's own buffers: whole tile, and per thread.
+pub(super) fn plan(shape: &Shape, params: &Params) -> Plan {
+    let features = shape.channels.planes_of(|role| matches!(role, super::Role::Feature { .. })).len();
+    // Without a film position the pixel's centre takes its place.
+    let film = shape.channels.planes_of(|role| matches!(role, super::Role::Film)).len();
+    let columns = shape.channels.planes() + 2 - film;
+    let rows = most_rows(params, shape.max_per_pixel as usize);
+    let grid = match params.information_grid {
+        1 => 0,
+        spacing => Grid::bytes(spacing, &region(shape.geometry, params, shape.varying, 0), features),
+    };
+    Plan {
+        working: shape.samples * 2 * 3 * 4 + grid + (rows as u64 + 1) * 8,
+        per_thread: Scratch::bytes(columns, features, rows, params.bins),
+        ..Plan::default()
+    }
+}
+
+/// Rows of the greatest neighbourhood.
+fn most_rows(params: &Params, max_per_pixel: usize) -> usize {
+    (0..params.boxes.len()).map(|t| params.neighbors(t, max_per_pixel)).max().unwrap_or(0)
+}
+
+/// Filters a tile.
+pub(super) fn filter(tile: &SampleTile, params: &Params, execution: &Execution) -> Result<Filtered, Stopped> {
+    let relevant = Relevant::of(tile);
+    let rows = most_rows(params, tile.max_per_pixel() as usize);
+    let terms = information::entropy_terms(rows);
+    let threads = execution.threads();
+    let mut scratches = Vec::with_capacity(threads);
+    scratches.resize_with(threads, || Scratch::new(&relevant, rows, params.bins));
+    let mut colors = interleaved_colors(tile);
+    let mut next = vec![0.0; colors.len()];
+    let iterations = params.boxes.len();
+    for t in 0..iterations {
+        let region = region(tile.geometry(), params, tile.varying(), t);
+        let offsets = neighborhood::Offsets::new(params.boxes[t]);
+        let pass = Pass {
+            tile,
+            relevant: &relevant,
+            params,
+            t,
+            seed: execution.seed,
+            offsets,
+            terms: &terms,
+            colors: &colors,
+        };
+        run(&pass, &region, &mut scratches, &mut next, execution);
+        if execution.stopped() {
+            return Err(Stopped);
+        }
+        std::mem::swap(&mut colors, &mut next);
+        if let Some(progress) = execution.progress {
+            progress((t + 1) as f32 / iterations as f32);
+        }
+    }
+    let spikes = scratches.iter().map(|scratch| scratch.spikes).sum();
+    drop((scratches, next));
+    let report = Report {
+        replaced: tile.replaced(),
+        spikes,
+        halo: tile.geometry().halo(),
+        halo_needed: tile.geometry().halo_for(params.reach(tile.varying())),
+        left_out: relevant.left_out,
+        ..Report::default()
+    };
+    Ok(finish(tile, &colors, params.fill_reach(), report))
+}
+
+/// The colours of all samples, R, G, B next to each other.
+fn interleaved_colors(tile: &SampleTile) -> Vec<f32> {
+    let mut colors = vec![0.0; 3 * tile.total()];
+    for (channel, plane) in tile.channels().color_planes().into_iter().enumerate() {
+        let place = colors.iter_mut().skip(channel).step_by(3);
+        match tile.plane(plane) {
+            Plane::Constant(value) => place.for_each(|c| *c = *value),
+            Plane::Values(values) => place.zip(values).for_each(|(c, value)| *c = *value),
+        }
+    }
+    colors
+}
+
+/// One iteration over a region, from `pass.colors` to `next`.
+fn run(pass: &Pass, region: &Rect, scratches: &mut [Scratch], next: &mut [f32], execution: &Execution) {
+    let level = execution.simd.level();
+    let window = pass.tile.geometry().window();
+    let spacing = pass.params.information_grid;
+    let stopped = || execution.stopped();
+    let grid = (spacing > 1).then(|| {
+        let image = pass.tile.geometry().image();
+        let mut grid = Grid::new(spacing, image, region, pass.relevant.features().len());
+        let (rows, nodes) = grid.rows();
+        share_out(execution, scratches, nodes, |scratch, (row, nodes)| {
+            if !stopped() {
+                dispatch!(level, simd => rows.weigh(simd, pass, scratch, row, nodes));
+            }
+        });
+        grid
+    });
+    let bands = (region.y..region.bottom()).step_by(BAND as usize).scan(next, |rest, y| {
+        let band = Rect::new(window.x, y, window.width, BAND.min(region.bottom() - y));
+        let first = pass.tile.samples_of(window.index(band.x, band.y)).start;
+        let end = pass.tile.samples_of(window.index(band.right() - 1, band.bottom() - 1)).end;
+        // `rest` starts with the region's first band, later with the one after the last.
+        let skip = if y == region.y { 3 * first } else { 0 };
+        let (out, after) = std::mem::take(rest)[skip..].split_at_mut(3 * (end - first));
+        *rest = after;
+        Some((band, out))
+    });
+    share_out(execution, scratches, bands, |scratch, (band, out)| {
+        dispatch!(level, simd => pass.band(simd, scratch, grid.as_ref(), region, &band, out, &stopped));
+    });
+}
+
+/// Works through the items, each thread with its own scratch, each taking the next item when it is done with one.
+fn share_out<T: Send>(
+    execution: &Execution,
+    scratches: &mut [Scratch],
+    items: impl Iterator<Item = T> + Send,
+    work: impl Fn(&mut Scratch, T) + Sync,
+) {
+    match execution.pool {
+        Some(pool) => {
+            let items = Mutex::new(items);
+            let next = || items.lock().ok().and_then(|mut items| items.next());
+            pool.scope(|scope| {
+                for scratch in scratches {
+                    scope.spawn(|_| {
+                        while let Some(item) = next() {
+                            work(scratch, item);
+                        }
+                    });
+                }
+            });
+        }
+        None => {
+            if let Some(scratch) = scratches.first_mut() {
+                items.for_each(|item| work(scratch, item));
+            }
+        }
+    }
+}
+
+/// The mean of each core pixel's samples; pixels without any are filled from those around them.
+fn finish(tile: &SampleTile, colors: &[f32], fill_reach: u32, mut report: Report) -> Filtered {
+    let (core, window) = (tile.geometry().core(), tile.geometry().window());
+    let planes = tile.channels().color_planes();
+    let mut rgb = [(); 3].map(|()| Vec::with_capacity(core.area() as usize));
+    for y in core.y..core.bottom() {
+        for x in core.x..core.right() {
+            let samples = tile.samples_of(window.index(x, y));
+            report.samples += samples.len() as u64;
+            for plane in planes {
+                report.energy_in += super::baseline::mean::mean(samples.clone().map(|s| tile.value(plane, s)));
+            }
+            let pixel = pixel_mean(tile, colors, x, y).or_else(|| {
+                let filled = fill(tile, colors, x, y, fill_reach);
+                *if filled.is_some() { &mut report.filled } else { &mut report.unfilled } += 1;
+                filled
+            });
+            for (value, plane) in pixel.unwrap_or([0.0; 3]).into_iter().zip(&mut rgb) {
+                report.energy_out += value;
+                plane.push(value as f32);
+            }
+        }
+    }
+    Filtered { core, rgb, report }
+}
+
+/// Mean of a pixel's filtered samples; none if it has no samples.
+fn pixel_mean(tile: &SampleTile, colors: &[f32], x: u32, y: u32) -> Option<[f64; 3]> {
+    let samples = tile.samples_of(tile.geometry().window().index(x, y));
+    let count = samples.len() as f64;
+    (count > 0.0)
+        .then(|| std::array::from_fn(|k| samples.clone().map(|s| f64::from(colors[3 * s + k])).sum::<f64>() / count))
+}
+
+/// Mean of the filtered pixels in the smallest window around a pixel that has any.
+fn fill(tile: &SampleTile, colors: &[f32], x: u32, y: u32, reach: u32) -> Option<[f64; 3]> {
+    let window = tile.geometry().window();
+    (1..=reach).find_map(|radius| {
+        let around = Rect::new(x, y, 1, 1).grown(radius, &window);
+        let (mut sum, mut count) = ([0.0; 3], 0.0);
+        for y in around.y..around.bottom() {
+            for mean in (around.x..around.right()).filter_map(|x| pixel_mean(tile, colors, x, y)) {
+                sum = std::array::from_fn(|k| sum[k] + mean[k]);
+                count += 1.0;
+            }
+        }
+        (count > 0.0).then(|| sum.map(|s| s / count))
+    })
+}

@@ -1,0 +1,141 @@
+//! Sixteen f32 lanes, the same on every CPU: the only file that names the SIMD crate.
+//!
+//! Only operations that IEEE 754 defines exactly are used (no fused multiply-add, no approximate reciprocals), sums run
+//! over 16 lanes in order and are folded in one fixed tree, and [`exp_neg`] is a polynomial of our own: so every level
+//! gives the same bits, the baseline included.
+
+use fearless_simd::Level;
+
+pub(crate) use fearless_simd::{Simd, dispatch, prelude};
+
+use prelude::*;
+
+/// Number of lanes; columns are padded to a multiple of it.
+pub(crate) const LANES: usize = 16;
+
+/// Sixteen lanes at one SIMD level.
+pub(crate) type Lanes<S> = fearless_simd::f32x16<S>;
+
+/// `n` rounded up to whole lanes.
+pub(crate) const fn padded(n: usize) -> usize {
+    n.next_multiple_of(LANES)
+}
+
+/// Which SIMD instructions are used. The result has the same bits at every level.
+#[derive(Clone, Copy, Debug)]
+pub struct SimdLevel(Level);
+
+impl Default for SimdLevel {
+    fn default() -> Self {
+        Self(Level::new())
+    }
+}
+
+impl SimdLevel {
+    /// The levels that this CPU has, lowest first, with their names.
+    pub fn available() -> Vec<(&'static str, Self)> {
+        let best = Level::new();
+        let mut levels = Vec::new();
+        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+        {
+            levels.extend(best.as_sse2().map(|s| ("sse2", Self(s.level()))));
+            levels.extend(best.as_sse4_2().map(|s| ("sse4.2", Self(s.level()))));
+            levels.extend(best.as_avx2().map(|s| ("avx2", Self(s.level()))));
+            levels.extend(best.as_avx512().map(|s| ("avx512", Self(s.level()))));
+        }
+        if levels.is_empty() {
+            levels.push(("best", Self(best)));
+        }
+        levels
+    }
+
+    pub(crate) const fn level(self) -> Level {
+        self.0
+    }
+}
+
+/// Sum of the lanes in a fixed tree: lane i with lane i + 8, then + 4, + 2, + 1.
+#[inline(always)]
+pub(crate) fn sum<S: Simd>(lanes: Lanes<S>) -> f32 {
+    let a: [f32; LANES] = lanes.to_array();
+    let b: [f32; 8] = std::array::from_fn(|i| a[i] + a[i + 8]);
+    let c: [f32; 4] = std::array::from_fn(|i| b[i] + b[i + 4]);
+    (c[0] + c[2]) + (c[1] + c[3])
+}
+
+/// Lanes below `n` are kept, the others become 0.
+#[inline(always)]
+pub(crate) fn keep_first<S: Simd>(simd: S, lanes: Lanes<S>, n: usize) -> Lanes<S> {
+    if n >= LANES {
+        return lanes;
+    }
+    let mask = fearless_simd::mask32x16::from_bitmask(simd, (1 << n) - 1);
+    mask.select(lanes, Lanes::splat(simd, 0.0))
+}
+
+/// Beyond this, [`exp_neg`] is 0: e^-80 is 1.8e-35.
+const EXP_END: f32 = 80.0;
+
+/// exp(-x) for x >= 0 (infinity included), within 2 units in the last place; 0 for x > 80.
+///
+/// Cody and Waite's reduction to |r| <= ln(2)/2 with ln 2 in two parts, then a polynomial of degree 6.
+#[inline(always)]
+pub(crate) fn exp_neg<S: Simd>(simd: S, x: Lanes<S>) -> Lanes<S> {
+    const LOG2_E: f32 = std::f32::consts::LOG2_E;
+    const LN_2_HIGH: f32 = 0.693_359_4;
+    const LN_2_LOW: f32 = -2.121_944_4e-4;
+    let lanes = |v: f32| Lanes::splat(simd, v);
+    let near = x.simd_le(lanes(EXP_END));
+    let y = -x.min(lanes(EXP_END));
+    let k = (y * lanes(LOG2_E)).round_ties_even();
+    let r = (y - k * lanes(LN_2_HIGH)) - k * lanes(LN_2_LOW);
+    let mut p = lanes(1.0 / 720.0);
+    for c in [1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0] {
+        p = p * r + lanes(c);
+    }
+    let exponent: fearless_simd::u32x16<S> = (k + lanes(127.0)).to_int();
+    near.select(p * Lanes::from_bits(exponent << 23), lanes(0.0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exp_is_close_and_the_same_on_every_level() {
+        let mut reference: Option<Vec<u32>> = None;
+        for (name, level) in SimdLevel::available() {
+            let mut bits = Vec::new();
+            let mut worst = 0.0f64;
+            for step in 0..20_000u32 {
+                let x: [f32; LANES] = std::array::from_fn(|lane| (step * 16 + lane as u32) as f32 * 2.51e-4);
+                let y: [f32; LANES] = dispatch!(level.level(), simd =>
+                    exp_neg(simd, Lanes::from_slice(simd, &x)).to_array());
+                for (x, y) in x.into_iter().zip(y) {
+                    bits.push(y.to_bits());
+                    let exact = libm::exp(-f64::from(x));
+                    if x <= EXP_END {
+                        worst = worst.max((f64::from(y) - exact).abs() / exact);
+                    } else {
+                        assert_eq!(y, 0.0);
+                    }
+                }
+            }
+            assert!(worst < 2.5e-7, "{name}: relative error {worst:e}");
+            assert_eq!(*reference.get_or_insert_with(|| bits.clone()), bits, "{name}");
+        }
+    }
+
+    #[test]
+    fn exp_at_its_ends() {
+        for (_, level) in SimdLevel::available() {
+            let x = [0.0, 80.0, 80.1, f32::MAX, f32::INFINITY, 1e-30, 1.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+            let y: [f32; LANES] =
+                dispatch!(level.level(), simd => exp_neg(simd, Lanes::from_slice(simd, &x)).to_array());
+            assert_eq!(y[0], 1.0);
+            assert!(y[1] > 0.0);
+            assert_eq!(y[2..5], [0.0; 3]);
+            assert_eq!(y[5], 1.0);
+        }
+    }
+}

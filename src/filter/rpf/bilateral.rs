@@ -1,0 +1,78 @@
+//! Step 5: the cross-bilateral filter over samples (eq. 6, 7).
+//!
+//! c''_i = sum_j w_ij c'_j / sum_j w_ij with w_ij = exp( -g/2 ( sum_k alpha_k dz_ck^2 + sum_k beta_k dz_fk^2 ) ). The
+//! factors go into the columns first, so that a distance is a plain sum of squared differences.
+
+use super::statistics::Span;
+use crate::filter::lanes::{LANES, Lanes, Simd, exp_neg, keep_first, prelude::*, sum};
+
+/// The columns of a neighbourhood that the filter reads.
+pub(crate) struct Distances<'a> {
+    /// Scaled columns, one after another, each `stride` values apart and padded to whole lanes.
+    pub(crate) columns: &'a [f32],
+    /// Values between the starts of two columns.
+    pub(crate) stride: usize,
+    /// Which columns count.
+    pub(crate) active: &'a [usize],
+    /// The three colour channels, laid out like `columns`, scaled by their [`Span::scale`].
+    pub(crate) radiance: &'a [f32],
+    /// What each colour channel spans.
+    pub(crate) spans: &'a [Span; 3],
+    /// Rows.
+    pub(crate) rows: usize,
+}
+
+/// Samples filtered at once, so that a column is read once for all of them.
+const BLOCK: usize = 4;
+
+/// Filters the first samples of the neighbourhood, as many as `out` has triples (R, G, B next to each other).
+#[inline(always)]
+pub(crate) fn filter<S: Simd>(simd: S, distances: &Distances, out: &mut [f32]) {
+    let mut first = 0;
+    let mut blocks = out.chunks_exact_mut(3 * BLOCK);
+    for block in &mut blocks {
+        filter_block::<S, BLOCK>(simd, distances, first, block);
+        first += BLOCK;
+    }
+    for single in blocks.into_remainder().chunks_exact_mut(3) {
+        filter_block::<S, 1>(simd, distances, first, single);
+        first += 1;
+    }
+}
+
+/// Filters `N` samples, from `first` on. Each sample's sums run in the same order whatever the block.
+#[inline(always)]
+fn filter_block<S: Simd, const N: usize>(simd: S, distances: &Distances, first: usize, out: &mut [f32]) {
+    let Distances { columns, stride, active, radiance, spans, rows } = *distances;
+    let zero = Lanes::splat(simd, 0.0);
+    let (mut weights, mut sums) = ([zero; N], [[zero; 3]; N]);
+    for start in (0..rows).step_by(LANES) {
+        let mut distance = [zero; N];
+        for &column in active {
+            let column = &columns[column * stride..][..stride];
+            let values = Lanes::from_slice(simd, &column[start..start + LANES]);
+            for (distance, &own) in distance.iter_mut().zip(&column[first..first + N]) {
+                let difference = values - Lanes::splat(simd, own);
+                *distance += difference * difference;
+            }
+        }
+        let colors: [Lanes<S>; 3] =
+            std::array::from_fn(|k| Lanes::from_slice(simd, &radiance[k * stride + start..][..LANES]));
+        for n in 0..N {
+            let weight = keep_first(simd, exp_neg(simd, distance[n]), rows - start);
+            weights[n] += weight;
+            for k in 0..3 {
+                sums[n][k] += weight * colors[k];
+            }
+        }
+    }
+    for (n, out) in out.chunks_exact_mut(3).enumerate() {
+        let weight = sum(weights[n]);
+        for k in 0..3 {
+            let Span { min, max, scale } = spans[k];
+            // The mean lies between the least and the greatest value; rounding must not take it out, nor to infinity.
+            let mean = (sum(sums[n][k]) / weight).max(min * scale).min(max * scale);
+            out[k] = mean / scale;
+        }
+    }
+}

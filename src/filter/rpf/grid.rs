@@ -1,0 +1,129 @@
+//! The information grid: weights at every G-th pixel of the image, interpolated bilinearly between.
+//!
+//! Nodes lie at image pixels whose x and y are multiples of G, the last one held inside the image. A node without
+//! samples, or outside the data window, has no weights; its share goes to the others.
+
+use super::iteration::{Pass, Scratch};
+use super::weights::Weights;
+use crate::filter::Rect;
+use crate::filter::lanes::Simd;
+
+/// Nodes that cover a region of the image.
+#[derive(Debug)]
+pub(crate) struct Grid {
+    spacing: u32,
+    image: Rect,
+    /// First node, and number of nodes, in x and y.
+    first: [u32; 2],
+    size: [usize; 2],
+    features: usize,
+    /// Of each node, row by row: colour weights, confidence, feature weights; the confidence is NaN where there are none.
+    nodes: Vec<f32>,
+}
+
+/// Values per node beside the features' weights.
+const FIXED: usize = 4;
+
+impl Grid {
+    /// The nodes around the pixels of a region, without weights yet.
+    pub(crate) fn new(spacing: u32, image: Rect, region: &Rect, features: usize) -> Self {
+        let first = [region.x / spacing, region.y / spacing];
+        let size = Self::nodes_of(spacing, region);
+        Self { spacing, image, first, size, features, nodes: vec![f32::NAN; size[0] * size[1] * (FIXED + features)] }
+    }
+
+    /// Nodes in x and y around the pixels of a region.
+    fn nodes_of(spacing: u32, region: &Rect) -> [usize; 2] {
+        let count = |start: u32, end: u32| ((end - 1) / spacing + 2 - start / spacing) as usize;
+        [count(region.x, region.right()), count(region.y, region.bottom())]
+    }
+
+    /// Bytes that [`Grid::new`] allocates.
+    pub(crate) fn bytes(spacing: u32, region: &Rect, features: usize) -> u64 {
+        let [columns, rows] = Self::nodes_of(spacing, region);
+        (columns * rows * (FIXED + features) * size_of::<f32>()) as u64
+    }
+
+    /// Image position of a node, along one axis of an image of this size.
+    const fn position(&self, node: u32, size: u32) -> u32 {
+        let position = node as u64 * self.spacing as u64;
+        if position >= size as u64 { size - 1 } else { position as u32 }
+    }
+
+    /// The node rows, each with its number, to be computed one by one.
+    pub(crate) fn rows(&mut self) -> (GridRows, impl Iterator<Item = (usize, &mut [f32])>) {
+        let rows = GridRows {
+            columns: (0..self.size[0] as u32).map(|i| self.position(self.first[0] + i, self.image.width)).collect(),
+            rows: (0..self.size[1] as u32).map(|i| self.position(self.first[1] + i, self.image.height)).collect(),
+            values: FIXED + self.features,
+        };
+        let length = self.size[0] * rows.values;
+        (rows, self.nodes.chunks_exact_mut(length).enumerate())
+    }
+
+    /// Weights at a pixel of the region; false if none of the nodes around it has any.
+    pub(crate) fn interpolate(&self, x: u32, y: u32, weights: &mut Weights) -> bool {
+        let axis = |pixel: u32, size: u32| {
+            let node = pixel / self.spacing;
+            let (low, high) = (self.position(node, size), self.position(node + 1, size));
+            let high_share = if high == low { 0.0 } else { (pixel - low) as f32 / (high - low) as f32 };
+            [(node, 1.0 - high_share), (node + 1, high_share)]
+        };
+        let width = FIXED + self.features;
+        let mut total = 0.0;
+        weights.color = [0.0; 3];
+        weights.confidence = 0.0;
+        weights.features.fill(0.0);
+        for (node_y, share_y) in axis(y, self.image.height) {
+            for (node_x, share_x) in axis(x, self.image.width) {
+                let share = share_x * share_y;
+                if share == 0.0 {
+                    continue;
+                }
+                let (column, row) = ((node_x - self.first[0]) as usize, (node_y - self.first[1]) as usize);
+                let node = &self.nodes[(row * self.size[0] + column) * width..][..width];
+                if node[3].is_nan() {
+                    continue;
+                }
+                total += share;
+                for (weight, value) in weights.color.iter_mut().zip(&node[..3]) {
+                    *weight += share * value;
+                }
+                weights.confidence += share * node[3];
+                for (weight, value) in weights.features.iter_mut().zip(&node[FIXED..]) {
+                    *weight += share * value;
+                }
+            }
+        }
+        if total == 0.0 {
+            return false;
+        }
+        let rest = weights.features.iter_mut().chain(&mut weights.color).chain([&mut weights.confidence]);
+        rest.for_each(|weight| *weight /= total);
+        true
+    }
+}
+
+/// Where the nodes lie.
+pub(crate) struct GridRows {
+    columns: Vec<u32>,
+    rows: Vec<u32>,
+    values: usize,
+}
+
+impl GridRows {
+    /// Computes the weights of one row of nodes.
+    #[inline(always)]
+    pub(crate) fn weigh<S: Simd>(&self, simd: S, pass: &Pass, scratch: &mut Scratch, row: usize, nodes: &mut [f32]) {
+        let y = self.rows[row];
+        let window = pass.tile.geometry().window();
+        for (&x, node) in self.columns.iter().zip(nodes.chunks_exact_mut(self.values)) {
+            if window.contains(x, y) && pass.weigh(simd, scratch, x, y) {
+                let Weights { color, features, confidence } = &scratch.weights;
+                node[..3].copy_from_slice(color);
+                node[3] = *confidence;
+                node[FIXED..].copy_from_slice(features);
+            }
+        }
+    }
+}
