@@ -96,8 +96,7 @@ pub fn errors(image: &[[f32; 3]], reference: &[[f32; 3]]) -> Result<Errors, Size
 
 /// NaN stays NaN.
 fn tone(value: f64) -> f64 {
-    let clipped = if value.is_nan() { value } else { value.min(1.0).max(0.0) };
-    clipped.powf(1.0 / 2.2)
+    value.clamp(0.0, 1.0).powf(1.0 / 2.2)
 }
 
 #[cfg(test)]

@@ -195,9 +195,9 @@ mod tests {
         *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         let random = (*state >> 33) as u32;
         let Rect { x, y, width, height } = rect;
-        if random % 5 == 0 || (width < 2 && height < 2) {
+        if random.is_multiple_of(5) || (width < 2 && height < 2) {
             out.push(rect);
-        } else if (random % 2 == 0 && width > 1) || height < 2 {
+        } else if (random.is_multiple_of(2) && width > 1) || height < 2 {
             let cut = 1 + (random >> 4) % (width - 1);
             pieces(Rect::new(x, y, cut, height), state, out);
             pieces(Rect::new(x + cut, y, width - cut, height), state, out);
