@@ -6,7 +6,7 @@ use std::{
     os::unix::fs::PermissionsExt,
     path::{Path, PathBuf},
 };
-use tempfile::NamedTempFile;
+use tempfile::TempPath;
 
 /// A file that appears under its name only when it is committed; dropped before that it leaves nothing behind.
 ///
@@ -14,7 +14,8 @@ use tempfile::NamedTempFile;
 /// written.
 #[derive(Debug)]
 pub struct AtomicFile {
-    out: BufWriter<NamedTempFile>,
+    out: BufWriter<File>,
+    temporary: TempPath,
     directory: PathBuf,
     target: PathBuf,
     given: PathBuf,
@@ -66,8 +67,9 @@ impl AtomicFile {
             .suffix(".tmp")
             .permissions(Permissions::from_mode(0o666))
             .tempfile_in(&directory)
-            .map_err(|e| fail("write", e))?;
-        Ok(Self { out: BufWriter::with_capacity(1 << 18, file), directory, target, given: path.to_owned() })
+            .map_err(|e| fail("write", without_name(e)))?;
+        let (file, temporary) = file.into_parts();
+        Ok(Self { out: BufWriter::with_capacity(1 << 18, file), temporary, directory, target, given: path.to_owned() })
     }
 
     /// Where to write the content.
@@ -77,21 +79,29 @@ impl AtomicFile {
 
     /// Makes the content durable and gives it its name.
     pub fn commit(self) -> Result<(), AtomicError> {
-        let Self { out, directory, target, given } = self;
+        let Self { out, temporary, directory, target, given } = self;
         let fail = |action, source| AtomicError { action, path: given, source };
         let file = match out.into_inner() {
             Ok(file) => file,
             Err(e) => return Err(fail("write", e.into_error())),
         };
-        let committed = (file.as_file().sync_all())
-            .and_then(|()| file.persist(&target).map_err(|e| e.error))
-            .and_then(|_| File::open(&directory)?.sync_all());
+        let committed = (file.sync_all())
+            .and_then(|()| temporary.persist(&target).map_err(|e| without_name(e.error)))
+            .and_then(|()| File::open(&directory)?.sync_all());
         committed.map_err(|source| fail("finish", source))
     }
 
     /// An error of this file, for one that occurred while its content was written.
     pub fn error(&self, source: io::Error) -> AtomicError {
         AtomicError { action: "write", path: self.given.clone(), source }
+    }
+}
+
+/// An error as the system gave it, without the temporary name, which means nothing to anybody.
+fn without_name(error: io::Error) -> io::Error {
+    match error.to_string().split_once(" at path ") {
+        Some((reason, _)) => io::Error::new(error.kind(), reason),
+        None => error,
     }
 }
 
@@ -145,6 +155,6 @@ mod tests {
     #[test]
     fn a_missing_directory_is_named() {
         let error = AtomicFile::create(Path::new("/nowhere/at/all/x.exr")).unwrap_err();
-        assert!(error.to_string().starts_with("cannot write /nowhere/at/all/x.exr: "), "{error}");
+        assert_eq!(error.to_string(), "cannot write /nowhere/at/all/x.exr: No such file or directory (os error 2)");
     }
 }

@@ -43,6 +43,11 @@ pub enum ExrSamples {
     Half,
 }
 
+impl ExrSamples {
+    /// All of them, by the names that users give.
+    pub const NAMES: [(&str, Self); 2] = [("float", Self::Float), ("half", Self::Half)];
+}
+
 /// How blocks are compressed; all without loss.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ExrCompression {
@@ -57,6 +62,12 @@ pub enum ExrCompression {
     Zip,
     /// Wavelets, 32 rows at a time.
     Piz,
+}
+
+impl ExrCompression {
+    /// All of them, by the names that users give.
+    pub const NAMES: [(&str, Self); 5] =
+        [("none", Self::None), ("rle", Self::Rle), ("zips", Self::Zips), ("zip", Self::Zip), ("piz", Self::Piz)];
 }
 
 /// How pixels are divided into blocks.

@@ -24,6 +24,12 @@ fn code(result: Result<Offer, rpfd::stitch::StitchError>) -> &'static str {
     result.unwrap_err().code()
 }
 
+/// The service moves an image between threads.
+const _: fn() = || {
+    fn movable<T: Send + Sync + 'static>() {}
+    movable::<(Stitcher, Claim)>();
+};
+
 #[test]
 fn tells_what_is_missing_whatever_the_order() {
     let mut cores: Vec<Rect> = tiling([64, 48], 16).collect();

@@ -10,18 +10,10 @@ use rpfd::{
 };
 use std::{io::Cursor, path::Path};
 
-pub(crate) const COMPRESSIONS: [(&str, ExrCompression); 5] = [
-    ("none", ExrCompression::None),
-    ("rle", ExrCompression::Rle),
-    ("zips", ExrCompression::Zips),
-    ("zip", ExrCompression::Zip),
-    ("piz", ExrCompression::Piz),
-];
-
 /// Every kind of file that can be asked for.
 pub(crate) fn all_options() -> impl Iterator<Item = (String, ExrOptions)> {
-    [("float", ExrSamples::Float), ("half", ExrSamples::Half)].into_iter().flat_map(|(type_name, samples)| {
-        COMPRESSIONS.into_iter().flat_map(move |(name, compression)| {
+    ExrSamples::NAMES.into_iter().flat_map(|(type_name, samples)| {
+        ExrCompression::NAMES.into_iter().flat_map(move |(name, compression)| {
             let layouts = [ExrLayout::Scanlines, ExrLayout::Tiles(16), ExrLayout::Tiles(61)];
             layouts.into_iter().map(move |layout| {
                 let attributes = provenance("lean", 42, [("boxes", "17,7".to_owned())]);
@@ -169,4 +161,32 @@ fn files_that_cannot_be_used_say_why() {
 
 fn rpfd_magic() -> Vec<u8> {
     [0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0].to_vec()
+}
+
+/// The writer asks for one block of pixels after another, so memory does not grow with the image's height, nor, in
+/// tiles, with its width.
+#[test]
+fn only_one_block_is_in_memory() {
+    struct Gray(std::cell::Cell<u64>);
+    impl Pixels for Gray {
+        fn image(&self) -> Rect {
+            Rect::new(0, 0, 2048, 2048)
+        }
+        fn read(&self, rect: Rect, pixels: &mut [[f32; 3]]) -> Result<(), rpfd::stitch::CanvasError> {
+            self.0.set(self.0.get().max(rect.area()));
+            pixels.fill([0.5; 3]);
+            Ok(())
+        }
+    }
+    for (compression, layout, most) in [
+        (ExrCompression::Zip, ExrLayout::Scanlines, 16 * 2048),
+        (ExrCompression::Zips, ExrLayout::Scanlines, 2048),
+        (ExrCompression::Zip, ExrLayout::Tiles(64), 64 * 64),
+    ] {
+        let gray = Gray(0.into());
+        let options = ExrOptions { samples: ExrSamples::Half, compression, layout, ..ExrOptions::default() };
+        let mut out = Cursor::new(Vec::new());
+        exr::encode(&gray, &options, &mut out).unwrap();
+        assert_eq!(gray.0.get(), most);
+    }
 }
