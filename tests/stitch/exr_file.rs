@@ -190,3 +190,22 @@ fn only_one_block_is_in_memory() {
         assert_eq!(gray.0.get(), most);
     }
 }
+
+#[test]
+fn damaged_files_are_errors_or_images_but_no_panics() {
+    let directory = tempfile::tempdir().unwrap();
+    let stitcher = stitched(19, 21, 32, 0, directory.path());
+    for (name, options) in all_options().step_by(4) {
+        let good = bytes(&stitcher, &options);
+        for i in 0..good.len().min(800) {
+            for value in [0, 1, 0x7f, 0x80, 0xff] {
+                let mut bad = good.clone();
+                bad[i] = value;
+                // A flipped size may say anything, but never more pixels than allowed.
+                if let Ok(image) = exr::decode(Cursor::new(&bad), &name, 4096) {
+                    assert!(image.pixels.len() <= 4096);
+                }
+            }
+        }
+    }
+}
