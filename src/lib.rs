@@ -4,7 +4,17 @@
 //! - [`synth`]: a small path tracer that makes such samples, for tests, benchmarks and `rpfd synth`.
 //!
 //! With the feature `program` (the default) everything around it:
+//!
+//! - `stitch`: the image being assembled from filtered tiles, and OpenEXR files.
+//! - `picture`: PNG pictures of linear images, alone and side by side.
+//! - `report`: how far an image is from its reference.
 #![forbid(unsafe_code)]
 
 pub mod filter;
+#[cfg(feature = "program")]
+pub mod picture;
+#[cfg(feature = "program")]
+pub mod report;
+#[cfg(feature = "program")]
+pub mod stitch;
 pub mod synth;

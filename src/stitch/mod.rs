@@ -1,0 +1,434 @@
+//! The image being assembled: filtered cores in, in any order; an EXR out.
+//!
+//! - [`coverage`]: which cores have come and what is missing.
+//! - [`canvas`]: their pixels, in a file.
+//! - [`exr`]: the finished image as OpenEXR; reference images.
+//! - [`atomic`]: files that are complete or not there.
+//!
+//! [`Stitcher`] joins them. A core goes through it in two steps, since filtering takes long and happens elsewhere:
+//! [`Stitcher::offer`] says before the filter whether the core is wanted, [`Stitcher::add`] takes the result. Between the
+//! two the core is claimed; the [`Claim`] is the right to deliver it, and dropping it (an error, a cut connection) gives
+//! the core free again.
+//!
+//! What happens when the same core comes twice is decided by the digest of its samples:
+//!
+//! | the core is | same samples | other samples | other samples, `replace` |
+//! |---|---|---|---|
+//! | stored | repeated | conflict | filtered, and takes the old one's place |
+//! | claimed | filtered too; the second to arrive is repeated | busy | filtered; the one offered last stays |
+//!
+//! A core that overlaps a stored or claimed one without being equal to it is refused, `replace` or not.
+//!
+//! The stitcher does no locking and no waiting; an image has one owner that all calls go through.
+
+pub mod atomic;
+pub mod canvas;
+pub mod coverage;
+pub mod exr;
+
+pub use canvas::{Canvas, CanvasError, Pixels, RgbImage};
+pub use exr::{ExrCompression, ExrError, ExrLayout, ExrOptions, ExrSamples, ExrSummary};
+
+use crate::filter::{
+    Filtered, Rect, Report, TileGeometry,
+    geometry::{GeometryError, Halo},
+    samples::Replaced,
+};
+use coverage::Coverage;
+use std::{
+    path::Path,
+    sync::{Arc, Weak},
+};
+
+/// A digest of a core's samples: equal digests mean equal samples.
+pub type Digest = [u8; 32];
+
+/// Why a core was refused, or the image could not be written.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum StitchError {
+    /// The core has no pixels or sticks out of the image.
+    #[error(transparent)]
+    Geometry(#[from] GeometryError),
+    /// The core overlaps another one.
+    #[error("tile {core} overlaps tile {other}, which came before: cores of one image must be equal or apart")]
+    Overlap {
+        /// The core that was refused.
+        core: Rect,
+        /// One that it overlaps.
+        other: Rect,
+    },
+    /// The core is stored, made from other samples.
+    #[error("tile {0} is already there, made from other samples; ask for it to be replaced if that is meant")]
+    Conflict(Rect),
+    /// The core is just being made from other samples.
+    #[error("tile {0} is just being made from other samples that came before")]
+    Busy(Rect),
+    /// While the core was filtered another one, offered later with `replace`, took its place.
+    #[error("tile {0} was replaced by a later one before it was done")]
+    Superseded(Rect),
+    /// Pixels are missing.
+    #[error("the image is not complete: {pixels} pixels are missing, the first of them in {first}")]
+    Incomplete {
+        /// Pixels missing.
+        pixels: u64,
+        /// The first of the missing regions.
+        first: Rect,
+    },
+    /// What was delivered is not what was claimed.
+    #[error("the result is not that of tile {0}")]
+    Mismatch(Rect),
+    /// The canvas failed.
+    #[error(transparent)]
+    Canvas(#[from] CanvasError),
+    /// The EXR could not be written.
+    #[error(transparent)]
+    Exr(#[from] ExrError),
+}
+
+impl StitchError {
+    /// A stable code.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::Geometry(_) => "invalid-geometry",
+            Self::Overlap { .. } => "tile-overlap",
+            Self::Conflict(_) => "tile-conflict",
+            Self::Busy(_) => "tile-busy",
+            Self::Superseded(_) => "tile-superseded",
+            Self::Incomplete { .. } => "image-incomplete",
+            Self::Mismatch(_) => "internal",
+            Self::Canvas(error) => error.code(),
+            Self::Exr(error) => error.code(),
+        }
+    }
+}
+
+/// What to do with an offered core.
+#[derive(Debug)]
+#[must_use]
+pub enum Offer {
+    /// Filter it and [`add`](Stitcher::add) the result.
+    Filter(Claim),
+    /// Nothing: it is stored, made from the same samples.
+    Repeated,
+}
+
+/// The right to deliver a core. Dropping it gives the core free.
+#[derive(Debug)]
+pub struct Claim {
+    core: Rect,
+    digest: Digest,
+    replace: bool,
+    /// Position in the order of all offers.
+    turn: u64,
+    alive: Arc<()>,
+}
+
+impl Claim {
+    /// The core that is claimed.
+    pub const fn core(&self) -> Rect {
+        self.core
+    }
+}
+
+/// What became of a delivered core.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Added {
+    /// It is on the canvas.
+    Stored,
+    /// The same core from the same samples came first.
+    Repeated,
+}
+
+#[derive(Debug)]
+struct Stored {
+    digest: Digest,
+    turn: u64,
+    report: Report,
+}
+
+#[derive(Debug)]
+struct Pending {
+    digest: Digest,
+    alive: Weak<()>,
+}
+
+#[derive(Debug, Default)]
+struct Entry {
+    stored: Option<Stored>,
+    pending: Vec<Pending>,
+}
+
+impl Entry {
+    fn forget_dead(&mut self) {
+        self.pending.retain(|pending| pending.alive.strong_count() > 0);
+    }
+}
+
+/// Sums over the reports of the stored tiles.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Totals {
+    /// Tiles stored.
+    pub tiles: u64,
+    /// Pixels in their cores.
+    pub pixels: u64,
+    /// Samples in their cores.
+    pub samples: u64,
+    /// Values made finite, in the data windows: halos count once for every tile that has them.
+    pub replaced: Replaced,
+    /// Colour values set by the spike step, over all iterations.
+    pub spikes: u64,
+    /// Sum of pixel values over channels, before.
+    pub energy_in: f64,
+    /// Sum of pixel values over channels, after.
+    pub energy_out: f64,
+    /// Pixels without samples that got their neighbours' mean.
+    pub filled: u64,
+    /// Pixels without samples that stayed black.
+    pub unfilled: u64,
+    /// Tiles that had less halo than the method reads.
+    pub short_of_halo: u64,
+    /// The widest halo that a tile would have needed, by side.
+    pub halo_needed: Halo,
+}
+
+impl Totals {
+    fn add(&mut self, core: &Rect, report: &Report) {
+        self.tiles += 1;
+        self.pixels += core.area();
+        self.samples += report.samples;
+        self.replaced.color += report.replaced.color;
+        self.replaced.feature += report.replaced.feature;
+        self.replaced.random += report.replaced.random;
+        self.replaced.film += report.replaced.film;
+        self.spikes += report.spikes;
+        self.energy_in += report.energy_in;
+        self.energy_out += report.energy_out;
+        self.filled += report.filled;
+        self.unfilled += report.unfilled;
+        self.short_of_halo += u64::from(!report.exact());
+        let (widest, needed) = (&mut self.halo_needed, &report.halo_needed);
+        widest.left = widest.left.max(needed.left);
+        widest.top = widest.top.max(needed.top);
+        widest.right = widest.right.max(needed.right);
+        widest.bottom = widest.bottom.max(needed.bottom);
+    }
+}
+
+/// An image being assembled.
+#[derive(Debug)]
+pub struct Stitcher {
+    coverage: Coverage<Entry>,
+    canvas: Canvas,
+    done: u64,
+    turn: u64,
+}
+
+impl Stitcher {
+    /// An empty image, its canvas in a file without a name in `directory`.
+    pub fn new(width: u32, height: u32, directory: &Path) -> Result<Self, StitchError> {
+        TileGeometry::new([width, height], Rect::new(0, 0, 1, 1), Halo::default())?;
+        Ok(Self::on(Canvas::temporary(width, height, directory)?))
+    }
+
+    /// An image on a given canvas, none of whose pixels count yet: see [`Self::restore`].
+    pub fn on(canvas: Canvas) -> Self {
+        let Rect { width, height, .. } = canvas.image();
+        Self { coverage: Coverage::new(width, height), canvas, done: 0, turn: 0 }
+    }
+
+    /// Asks whether a core, made from samples with this digest, is wanted.
+    ///
+    /// With `replace` a stored core made from other samples may be replaced.
+    pub fn offer(&mut self, core: Rect, digest: Digest, replace: bool) -> Result<Offer, StitchError> {
+        self.check(core)?;
+        if let Some(entry) = self.coverage.get_mut(&core) {
+            entry.forget_dead();
+            match &entry.stored {
+                Some(stored) if stored.digest == digest && entry.pending.iter().all(|p| p.digest == digest) => {
+                    return Ok(Offer::Repeated);
+                }
+                Some(stored) if stored.digest != digest && !replace => return Err(StitchError::Conflict(core)),
+                _ => {}
+            }
+            if !replace && entry.pending.iter().any(|pending| pending.digest != digest) {
+                return Err(StitchError::Busy(core));
+            }
+        } else {
+            self.coverage.insert(core, Entry::default());
+        }
+        self.turn += 1;
+        let claim = Claim { core, digest, replace, turn: self.turn, alive: Arc::new(()) };
+        if let Some(entry) = self.coverage.get_mut(&core) {
+            entry.pending.push(Pending { digest, alive: Arc::downgrade(&claim.alive) });
+        }
+        Ok(Offer::Filter(claim))
+    }
+
+    /// Puts a filtered core on the canvas. If that fails the core is missing afterwards.
+    pub fn add(&mut self, claim: Claim, filtered: &Filtered) -> Result<Added, StitchError> {
+        let core = claim.core;
+        let area = core.area();
+        if filtered.core != core || filtered.rgb.iter().any(|plane| plane.len() as u64 != area) {
+            return Err(StitchError::Mismatch(core));
+        }
+        // The entry lives as long as the claim, unless the claim is another image's.
+        let entry = self.coverage.get_mut(&core).ok_or(StitchError::Mismatch(core))?;
+        let mine = entry.pending.iter().position(|pending| pending.alive.as_ptr() == Arc::as_ptr(&claim.alive));
+        entry.pending.swap_remove(mine.ok_or(StitchError::Mismatch(core))?);
+        match &mut entry.stored {
+            Some(stored) if stored.digest == claim.digest => {
+                stored.turn = stored.turn.max(claim.turn);
+                return Ok(Added::Repeated);
+            }
+            Some(stored) if stored.turn > claim.turn => return Err(StitchError::Superseded(core)),
+            Some(_) if !claim.replace => return Err(StitchError::Conflict(core)),
+            _ => {}
+        }
+        if entry.stored.take().is_some() {
+            self.done -= area;
+        }
+        let [r, g, b] = &filtered.rgb;
+        self.canvas.write(core, [r, g, b])?;
+        entry.stored = Some(Stored { digest: claim.digest, turn: claim.turn, report: filtered.report.clone() });
+        self.done += area;
+        Ok(Added::Stored)
+    }
+
+    /// Counts a core as stored that is on the canvas already, after a restart. Cores that are known or claimed are
+    /// refused.
+    pub fn restore(&mut self, core: Rect, digest: Digest, report: Report) -> Result<(), StitchError> {
+        self.check(core)?;
+        if self.coverage.get(&core).is_some() {
+            return Err(StitchError::Conflict(core));
+        }
+        self.coverage.insert(core, Entry { stored: Some(Stored { digest, turn: 0, report }), pending: Vec::new() });
+        self.done += core.area();
+        Ok(())
+    }
+
+    /// Refuses a core outside the image or across others; forgets claims that were given up on the way.
+    fn check(&mut self, core: Rect) -> Result<(), StitchError> {
+        let Rect { width, height, .. } = self.image();
+        TileGeometry::new([width, height], core, Halo::default())?;
+        for other in self.coverage.overlapping(&core) {
+            let entry = self.coverage.get_mut(&other);
+            if entry.is_some_and(|entry| {
+                entry.forget_dead();
+                entry.stored.is_some() || !entry.pending.is_empty()
+            }) {
+                return Err(StitchError::Overlap { core, other });
+            }
+            self.coverage.remove(&other);
+        }
+        Ok(())
+    }
+
+    /// The image as a rectangle at (0, 0).
+    pub const fn image(&self) -> Rect {
+        self.coverage.image()
+    }
+
+    /// The canvas. Where pixels are missing it may hold remains of an interrupted write: see [`Self::pixels`].
+    pub const fn canvas(&self) -> &Canvas {
+        &self.canvas
+    }
+
+    /// Number of pixels stored.
+    pub const fn pixels_done(&self) -> u64 {
+        self.done
+    }
+
+    /// Whether every pixel is stored.
+    pub const fn is_complete(&self) -> bool {
+        self.done == self.image().area()
+    }
+
+    /// The pixels that are not stored, as few rectangles, by rows. They do not depend on the order of arrival.
+    pub fn missing(&self) -> Vec<Rect> {
+        coverage::gaps(self.image(), self.tiles().map(|(core, _)| core))
+    }
+
+    /// The stored tiles by rows, with their reports.
+    pub fn tiles(&self) -> impl Iterator<Item = (Rect, &Report)> {
+        self.coverage.iter().filter_map(|(core, entry)| Some((core, &entry.stored.as_ref()?.report)))
+    }
+
+    /// Sums over the stored tiles; the same whatever the order of arrival.
+    pub fn totals(&self) -> Totals {
+        let mut totals = Totals::default();
+        self.tiles().for_each(|(core, report)| totals.add(&core, report));
+        totals
+    }
+
+    /// Refuses while pixels are missing, unless `partial`. Otherwise says how many are.
+    pub fn check_complete(&self, partial: bool) -> Result<u64, StitchError> {
+        let pixels = self.image().area() - self.done;
+        if pixels > 0 && !partial {
+            let first = self.missing()[0];
+            return Err(StitchError::Incomplete { pixels, first });
+        }
+        Ok(pixels)
+    }
+
+    /// The stored pixels, black where they are missing.
+    pub fn pixels(&self) -> StoredPixels<'_> {
+        let missing = if self.is_complete() { Vec::new() } else { self.missing() };
+        StoredPixels { canvas: &self.canvas, missing }
+    }
+
+    /// Writes the image as an EXR file: complete, durable and under its name, or not at all.
+    ///
+    /// While pixels are missing this is an error, unless `partial`: then they are black, and the attribute
+    /// `rpfd:missing` says how many there are.
+    pub fn write_exr(&self, options: &ExrOptions, partial: bool, path: &Path) -> Result<ExrSummary, StitchError> {
+        let options = self.options(options, partial)?;
+        Ok(exr::write(&self.pixels(), &options, path)?)
+    }
+
+    /// As [`Self::write_exr`], to a stream that buffers.
+    pub fn encode_exr(
+        &self,
+        options: &ExrOptions,
+        partial: bool,
+        out: &mut (impl std::io::Write + std::io::Seek),
+    ) -> Result<ExrSummary, StitchError> {
+        let options = self.options(options, partial)?;
+        Ok(exr::encode(&self.pixels(), &options, out)?)
+    }
+
+    fn options(&self, options: &ExrOptions, partial: bool) -> Result<ExrOptions, StitchError> {
+        let mut options = options.clone();
+        let missing = self.check_complete(partial)?;
+        if missing > 0 {
+            options.attributes.insert("rpfd:missing".into(), missing.to_string());
+        }
+        Ok(options)
+    }
+}
+
+/// The pixels of a [`Stitcher`]; those that are missing are black, whatever an interrupted write left on the canvas.
+#[derive(Debug)]
+pub struct StoredPixels<'a> {
+    canvas: &'a Canvas,
+    missing: Vec<Rect>,
+}
+
+impl Pixels for StoredPixels<'_> {
+    fn image(&self) -> Rect {
+        self.canvas.image()
+    }
+
+    fn read(&self, rect: Rect, pixels: &mut [[f32; 3]]) -> Result<(), CanvasError> {
+        self.canvas.read(rect, pixels)?;
+        // Missing regions are ordered by y.
+        let below = self.missing.partition_point(|gap| gap.y < rect.bottom());
+        for gap in self.missing[..below].iter().filter_map(|gap| gap.intersection(&rect)) {
+            for y in gap.y..gap.bottom() {
+                let start = rect.index(gap.x, y);
+                pixels[start..start + gap.width as usize].fill([0.0; 3]);
+            }
+        }
+        Ok(())
+    }
+}
