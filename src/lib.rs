@@ -8,8 +8,13 @@
 //! - `stitch`: the image being assembled from filtered tiles, and OpenEXR files.
 //! - `picture`: PNG pictures of linear images, alone and side by side.
 //! - `report`: how far an image is from its reference.
+//! - `store`: samples on disk, from which tiles of any size are cut.
+//! - `wire`: tiles and results as MessagePack, without I/O, and files of tiles.
+//! - `cli`: the `rpfd` command, one file per subcommand.
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "program")]
+pub mod cli;
 pub mod filter;
 #[cfg(feature = "program")]
 pub mod picture;
@@ -17,4 +22,8 @@ pub mod picture;
 pub mod report;
 #[cfg(feature = "program")]
 pub mod stitch;
+#[cfg(feature = "program")]
+pub mod store;
 pub mod synth;
+#[cfg(feature = "program")]
+pub mod wire;

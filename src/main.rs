@@ -1,2 +1,5 @@
-//! The `rpfd` command.
-fn main() {}
+//! The `rpfd` command: parse, run, exit code.
+
+fn main() -> std::process::ExitCode {
+    rpfd::cli::main()
+}

@@ -1,0 +1,5 @@
+//! What is kept outside the filter's memory: the samples of images that do not fit into it.
+
+pub mod spool;
+
+pub use spool::{Spool, SpoolError};

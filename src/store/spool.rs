@@ -1,0 +1,577 @@
+//! Samples of a whole image, kept as bare cores, from which tiles with any halo are cut.
+//!
+//! The tiles of a stream go in as they come, event by event, halos dropped, values as they are on the wire; a
+//! [`SampleTile`] of any geometry comes out. Memory: an index (per tile a few hundred bytes; with varying samples 8 more
+//! per row of the core) and buffers of fixed size; the values themselves are in one block of memory or in an unlinked
+//! temporary file, which is gone when the process is.
+//!
+//! [`scan`](crate::wire::scan) says how many bytes a file will take before anything is written.
+
+use std::{fs::File, io, io::Write, os::unix::fs::FileExt, path::Path};
+
+use crate::{
+    filter::{
+        ChannelSet, Counts, Plane, Rect, SampleTile, TileGeometry,
+        samples::{SampleError, sample_total},
+    },
+    wire::{
+        Coverage, Event, Format, Header, SampleCounts,
+        value::{CountReader, ValueReader},
+    },
+};
+
+/// Bytes that are collected before they are written to a file.
+const WRITE_BUFFER: usize = 256 << 10;
+
+/// A spool that cannot take or give samples; says why.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SpoolError {
+    /// Two cores share pixels.
+    #[error("tile {tile} overlaps tile {other}: the tiles of an image must not share pixels")]
+    Overlap {
+        /// The core that was refused.
+        tile: Rect,
+        /// The core that is already there.
+        other: Rect,
+    },
+    /// A tile of another image.
+    #[error("tile {tile} differs from the tiles before in {what}: all tiles of an image must agree")]
+    Disagreement {
+        /// The core that was refused.
+        tile: Rect,
+        /// What differs.
+        what: &'static str,
+    },
+    /// Pixels that no tile has brought.
+    #[error("the window {window} needs pixels that no tile has brought: {}", list(missing))]
+    Missing {
+        /// The data window that was asked for.
+        window: Rect,
+        /// The parts of it that are missing.
+        missing: Vec<Rect>,
+    },
+    /// More bytes than the spool may have.
+    #[error("the spool would need more than the {limit} bytes that it may have")]
+    Full {
+        /// Bytes it may have.
+        limit: u64,
+    },
+    /// The cut tile would have more samples than any tile may.
+    #[error(transparent)]
+    Samples(#[from] SampleError),
+    /// The system refuses to write or read.
+    #[error("the spool: {0}")]
+    Io(#[from] io::Error),
+}
+
+impl SpoolError {
+    /// A stable word for the kind of error.
+    pub const fn code(&self) -> &'static str {
+        match self {
+            Self::Overlap { .. } => "overlap",
+            Self::Disagreement { .. } => "disagreement",
+            Self::Missing { .. } => "missing",
+            Self::Full { .. } => "spool_full",
+            Self::Samples(_) => "too_large",
+            Self::Io(_) => "io",
+        }
+    }
+}
+
+/// The first few rectangles, in words.
+fn list(rects: &[Rect]) -> String {
+    let shown: Vec<_> = rects.iter().take(4).map(Rect::to_string).collect();
+    let more = if rects.len() > 4 { format!(" and {} more", rects.len() - 4) } else { String::new() };
+    format!("{}{more}", shown.join(", "))
+}
+
+/// Samples of an image, and where each of them is. See the [module](self).
+#[derive(Debug)]
+pub struct Spool {
+    backing: Backing,
+    tiles: Coverage<Stored>,
+    /// Image and channels, of the first tile.
+    first: Option<(Rect, ChannelSet)>,
+    /// The tile that is coming in.
+    open: Option<Open>,
+}
+
+/// A stored core.
+#[derive(Debug)]
+struct Stored {
+    samples: StoredSamples,
+    planes: Vec<StoredPlane>,
+}
+
+#[derive(Debug)]
+enum StoredSamples {
+    Uniform(u32),
+    /// Where the counts are, and the position in each plane at which each row of the core starts, and their end.
+    Varying {
+        offset: u64,
+        rows: Vec<u64>,
+    },
+}
+
+#[derive(Clone, Copy, Debug)]
+enum StoredPlane {
+    Constant(f32),
+    /// The core's values, in order, from this byte on.
+    Values {
+        offset: u64,
+        format: Format,
+    },
+}
+
+/// A tile that is coming in.
+#[derive(Debug)]
+struct Open {
+    header: Header,
+    stored: Stored,
+    counts: CountReader,
+    /// The runs of samples of the core in a plane of the data window, and how far the plane has come.
+    cursor: Cursor,
+    /// With varying samples the runs become known with the counts: (start, end) in samples, one a row.
+    runs: Vec<(u64, u64)>,
+    /// Pixel, and sample, of the data window at which the counts are.
+    pixel: u64,
+    sample: u64,
+    /// Bytes of the backing ahead of this tile, to fall back to.
+    before: u64,
+}
+
+/// How far a plane has come.
+#[derive(Clone, Copy, Debug, Default)]
+struct Cursor {
+    byte: u64,
+    run: usize,
+}
+
+impl Open {
+    /// The samples of the core in one row: start and end in a plane of the data window.
+    fn run(&self, row: usize) -> Option<(u64, u64)> {
+        let (window, core) = (self.header.geometry().window(), self.header.geometry().core());
+        match self.header.samples() {
+            SampleCounts::Varying { .. } => self.runs.get(row).copied(),
+            SampleCounts::Uniform(_) if row >= core.height as usize => None,
+            SampleCounts::Uniform(n) => {
+                let pixel = window.index(core.x, core.y + row as u32) as u64;
+                Some((pixel * u64::from(n), (pixel + u64::from(core.width)) * u64::from(n)))
+            }
+        }
+    }
+}
+
+impl Spool {
+    /// A spool in memory: one block of `bytes` is reserved now, and more than that refused.
+    pub fn in_memory(bytes: u64) -> Self {
+        let limit = usize::try_from(bytes).unwrap_or(usize::MAX);
+        Self::new(Backing::Memory { bytes: Vec::with_capacity(limit), limit: bytes })
+    }
+
+    /// A spool in an unlinked file in this folder, of at most `limit` bytes.
+    pub fn on_disk(folder: &Path, limit: u64) -> Result<Self, SpoolError> {
+        let file = tempfile::tempfile_in(folder)?;
+        Ok(Self::new(Backing::Disk { file, written: 0, buffer: Vec::with_capacity(WRITE_BUFFER), limit }))
+    }
+
+    fn new(backing: Backing) -> Self {
+        Self { backing, tiles: Coverage::default(), first: None, open: None }
+    }
+
+    /// Takes the next event of a tile stream. After an error of a tile, or when its stream ends early, nothing of the
+    /// tile stays; events up to the next header are ignored.
+    pub fn push(&mut self, event: &Event) -> Result<(), SpoolError> {
+        let result = self.take(event);
+        if result.is_err() {
+            self.discard();
+        }
+        result
+    }
+
+    /// Forgets the tile that is coming in, if one is.
+    pub fn discard(&mut self) {
+        if let Some(open) = self.open.take() {
+            self.backing.truncate(open.before);
+        }
+    }
+
+    fn take(&mut self, event: &Event) -> Result<(), SpoolError> {
+        if let Event::Header(header) = event {
+            self.discard();
+            return self.start(header);
+        }
+        let (Some(open), backing) = (&mut self.open, &mut self.backing) else { return Ok(()) };
+        match event {
+            Event::Counts(bytes) => {
+                let (window, core) = (open.header.geometry().window(), open.header.geometry().core());
+                let mut kept = Vec::new();
+                let Open { counts, pixel, sample, runs, .. } = open;
+                counts.push(bytes, |count| {
+                    let x = window.x + (*pixel % u64::from(window.width)) as u32;
+                    let y = window.y + (*pixel / u64::from(window.width)) as u32;
+                    if core.contains(x, y) {
+                        if x == core.x {
+                            runs.push((*sample, *sample));
+                        }
+                        if let Some((_, end)) = runs.last_mut() {
+                            *end += u64::from(count);
+                        }
+                        kept.extend_from_slice(&count.to_le_bytes());
+                    }
+                    *pixel += 1;
+                    *sample += u64::from(count);
+                });
+                backing.append(&kept)?;
+            }
+            Event::Constant { value, .. } => {
+                open.start_planes();
+                open.stored.planes.push(StoredPlane::Constant(*value));
+            }
+            Event::Values { plane, bytes } => {
+                open.start_planes();
+                if open.cursor.byte == 0 {
+                    let format = open.header.plane_format(*plane);
+                    open.stored.planes.push(StoredPlane::Values { offset: backing.len(), format });
+                }
+                open.keep(*plane, bytes, backing)?;
+            }
+            Event::PlaneEnd { plane } => {
+                open.start_planes();
+                if open.cursor.byte == 0 {
+                    // A plane without samples.
+                    let format = open.header.plane_format(*plane);
+                    open.stored.planes.push(StoredPlane::Values { offset: backing.len(), format });
+                }
+                open.cursor = Cursor::default();
+            }
+            Event::TileEnd => return self.end(),
+            Event::Header(_) => {}
+        }
+        Ok(())
+    }
+
+    fn start(&mut self, header: &Header) -> Result<(), SpoolError> {
+        let tile = header.geometry().core();
+        if let Some((image, channels)) = &self.first {
+            let disagreement = |what| Err(SpoolError::Disagreement { tile, what });
+            if *image != header.geometry().image() {
+                return disagreement("the size of the image");
+            }
+            if channels != header.channels() {
+                return disagreement("the channels");
+            }
+        }
+        if let Some((other, _)) = self.tiles.meeting(&tile).next() {
+            return Err(SpoolError::Overlap { tile, other: *other });
+        }
+        let before = self.backing.len();
+        let samples = match header.samples() {
+            SampleCounts::Uniform(n) => StoredSamples::Uniform(n),
+            SampleCounts::Varying { .. } => StoredSamples::Varying { offset: before, rows: Vec::new() },
+        };
+        self.open = Some(Open {
+            header: header.clone(),
+            stored: Stored { samples, planes: Vec::with_capacity(header.channels().planes()) },
+            counts: CountReader::default(),
+            cursor: Cursor::default(),
+            runs: Vec::new(),
+            pixel: 0,
+            sample: 0,
+            before,
+        });
+        Ok(())
+    }
+
+    fn end(&mut self) -> Result<(), SpoolError> {
+        self.backing.flush()?;
+        let Some(open) = self.open.take() else { return Ok(()) };
+        let (geometry, tile) = (open.header.geometry(), open.header.geometry().core());
+        self.tiles.insert(tile, open.stored).map_err(|other| SpoolError::Overlap { tile, other })?;
+        self.first.get_or_insert_with(|| (geometry.image(), open.header.channels().clone()));
+        Ok(())
+    }
+
+    /// Bytes of the backing that are used.
+    pub const fn bytes(&self) -> u64 {
+        self.backing.len()
+    }
+
+    /// Cores that are there.
+    pub fn tiles(&self) -> impl Iterator<Item = Rect> {
+        self.tiles.items().iter().map(|(core, _)| *core)
+    }
+
+    /// The parts of a window that no tile has brought, as rectangles that do not overlap.
+    pub fn missing(&self, window: &Rect) -> Vec<Rect> {
+        self.tiles.missing(window)
+    }
+
+    /// The channels of the image, once a tile is in.
+    pub fn channels(&self) -> Option<&ChannelSet> {
+        self.first.as_ref().map(|(_, channels)| channels)
+    }
+
+    /// A tile of this geometry, which must be of the same image. Memory: the tile, 4 bytes a pixel, and a row of samples.
+    pub fn cut(&self, geometry: TileGeometry) -> Result<SampleTile, SpoolError> {
+        let window = geometry.window();
+        let (tile, missing) = (geometry.core(), self.missing(&window));
+        let Some((image, channels)) = &self.first else { return Err(SpoolError::Missing { window, missing }) };
+        if geometry.image() != *image {
+            return Err(SpoolError::Disagreement { tile, what: "the size of the image" });
+        }
+        if !missing.is_empty() {
+            return Err(SpoolError::Missing { window, missing });
+        }
+        let parts: Vec<&(Rect, Stored)> = self.tiles.meeting(&window).collect();
+        let layout = self.layout(&window, &parts)?;
+        let planes = (0..channels.planes()).map(|plane| self.plane(&window, &parts, &layout, plane));
+        let planes = planes.collect::<Result<Vec<_>, _>>()?;
+        Ok(SampleTile::new(geometry, channels.clone(), layout.into_counts(), planes)?)
+    }
+
+    /// Where each pixel's samples go.
+    fn layout(&self, window: &Rect, parts: &[&(Rect, Stored)]) -> Result<Layout, SpoolError> {
+        let mut uniform = parts.iter().map(|(_, stored)| match stored.samples {
+            StoredSamples::Uniform(n) => Some(n),
+            StoredSamples::Varying { .. } => None,
+        });
+        let first = uniform.next().flatten();
+        let counts = match first {
+            Some(n) if uniform.all(|other| other == first) => Counts::Uniform(n),
+            _ => {
+                let mut counts = vec![0; window.area() as usize];
+                let mut bytes = Vec::new();
+                for (core, stored) in parts {
+                    let Some(part) = core.intersection(window) else { continue };
+                    for y in part.y..part.bottom() {
+                        let at = window.index(part.x, y);
+                        let row = &mut counts[at..at + part.width as usize];
+                        match &stored.samples {
+                            StoredSamples::Uniform(n) => row.fill(*n as u16),
+                            StoredSamples::Varying { offset, .. } => {
+                                let from = offset + 2 * core.index(part.x, y) as u64;
+                                self.read_counts(from, part.width, &mut bytes)?;
+                                let (values, _) = bytes.as_chunks::<2>();
+                                row.iter_mut().zip(values).for_each(|(to, from)| *to = u16::from_le_bytes(*from));
+                            }
+                        }
+                    }
+                }
+                Counts::Varying(counts)
+            }
+        };
+        let total = sample_total(window.area(), &counts)? as usize;
+        let mut rows = Vec::with_capacity(window.height as usize + 1);
+        if let Counts::Varying(counts) = &counts {
+            let mut at = 0;
+            rows.push(0);
+            rows.extend(counts.chunks(window.width as usize).map(|row| {
+                at += sum(row);
+                at
+            }));
+        }
+        Ok(Layout { counts, rows, total })
+    }
+
+    fn read_counts(&self, offset: u64, pixels: u32, bytes: &mut Vec<u8>) -> io::Result<()> {
+        bytes.resize(2 * pixels as usize, 0);
+        self.backing.read(offset, bytes)
+    }
+
+    fn plane(
+        &self,
+        window: &Rect,
+        parts: &[&(Rect, Stored)],
+        layout: &Layout,
+        plane: usize,
+    ) -> Result<Plane, SpoolError> {
+        let constant = |stored: &Stored| match stored.planes[plane] {
+            StoredPlane::Constant(value) => Some(value),
+            StoredPlane::Values { .. } => None,
+        };
+        if let Some(value) = parts.first().and_then(|(_, stored)| constant(stored)) {
+            let same = |other: f32| other == value || (other.is_nan() && value.is_nan());
+            if parts.iter().all(|(_, stored)| constant(stored).is_some_and(same)) {
+                return Ok(Plane::Constant(value));
+            }
+        }
+        let mut values = vec![0.0; layout.total];
+        let mut bytes = Vec::new();
+        for (core, stored) in parts {
+            let Some(part) = core.intersection(window) else { continue };
+            for y in part.y..part.bottom() {
+                let into = layout.range(window, part.x, part.right(), y);
+                let into = &mut values[into];
+                let (offset, format) = match stored.planes[plane] {
+                    StoredPlane::Constant(value) => {
+                        into.fill(value);
+                        continue;
+                    }
+                    StoredPlane::Values { offset, format } => (offset, format),
+                };
+                let from = match &stored.samples {
+                    StoredSamples::Uniform(n) => core.index(part.x, y) as u64 * u64::from(*n),
+                    StoredSamples::Varying { offset, rows } => {
+                        let row = core.index(core.x, y) as u64;
+                        let ahead = part.x - core.x;
+                        self.read_counts(offset + 2 * row, ahead, &mut bytes)?;
+                        let mut from = rows[(y - core.y) as usize];
+                        CountReader::default().push(&bytes, |count| from += u64::from(count));
+                        from
+                    }
+                };
+                bytes.resize(into.len() * format.bytes() as usize, 0);
+                self.backing.read(offset + from * format.bytes(), &mut bytes)?;
+                let mut slots = into.iter_mut();
+                ValueReader::new(format).push(&bytes, |value| {
+                    if let Some(slot) = slots.next() {
+                        *slot = value;
+                    }
+                });
+            }
+        }
+        Ok(Plane::Values(values))
+    }
+}
+
+impl Open {
+    /// With the counts all in, the rows of the core are known.
+    fn start_planes(&mut self) {
+        if let StoredSamples::Varying { rows, .. } = &mut self.stored.samples
+            && rows.is_empty()
+        {
+            let mut at = 0;
+            rows.push(0);
+            rows.extend(self.runs.iter().map(|(start, end)| {
+                at += end - start;
+                at
+            }));
+        }
+    }
+
+    /// Keeps what of these bytes, the next of a plane, belongs to the core.
+    fn keep(&mut self, plane: usize, bytes: &[u8], backing: &mut Backing) -> Result<(), SpoolError> {
+        let size = self.header.plane_format(plane).bytes();
+        let (from, to) = (self.cursor.byte, self.cursor.byte + bytes.len() as u64);
+        while let Some((start, end)) = self.run(self.cursor.run) {
+            let (start, end) = (start * size, end * size);
+            let (first, last) = (start.max(from), end.min(to));
+            if first < last {
+                backing.append(&bytes[(first - from) as usize..(last - from) as usize])?;
+            }
+            if end > to {
+                break;
+            }
+            self.cursor.run += 1;
+        }
+        self.cursor.byte = to;
+        Ok(())
+    }
+}
+
+/// Where the samples of a data window go.
+struct Layout {
+    counts: Counts,
+    /// With varying samples the position at which each row of the window starts, and their end.
+    rows: Vec<usize>,
+    total: usize,
+}
+
+impl Layout {
+    /// The samples of the pixels `left..right` of a row.
+    fn range(&self, window: &Rect, left: u32, right: u32, y: u32) -> std::ops::Range<usize> {
+        let first = window.index(left, y);
+        let pixels = first..first + (right - left) as usize;
+        match &self.counts {
+            Counts::Uniform(n) => pixels.start * *n as usize..pixels.end * *n as usize,
+            Counts::Varying(counts) => {
+                let start = self.rows[(y - window.y) as usize] + sum(&counts[window.index(window.x, y)..pixels.start]);
+                start..start + sum(&counts[pixels])
+            }
+        }
+    }
+
+    fn into_counts(self) -> Counts {
+        self.counts
+    }
+}
+
+fn sum(counts: &[u16]) -> usize {
+    counts.iter().map(|&n| usize::from(n)).sum()
+}
+
+/// The bytes of a spool.
+#[derive(Debug)]
+enum Backing {
+    Memory { bytes: Vec<u8>, limit: u64 },
+    Disk { file: File, written: u64, buffer: Vec<u8>, limit: u64 },
+}
+
+impl Backing {
+    const fn len(&self) -> u64 {
+        match self {
+            Self::Memory { bytes, .. } => bytes.len() as u64,
+            Self::Disk { written, buffer, .. } => *written + buffer.len() as u64,
+        }
+    }
+
+    fn append(&mut self, more: &[u8]) -> Result<(), SpoolError> {
+        let (Self::Memory { limit, .. } | Self::Disk { limit, .. }) = self;
+        let limit = *limit;
+        if self.len().checked_add(more.len() as u64).is_none_or(|len| len > limit) {
+            return Err(SpoolError::Full { limit });
+        }
+        match self {
+            Self::Memory { bytes, .. } => bytes.extend_from_slice(more),
+            Self::Disk { buffer, .. } => {
+                if buffer.len() + more.len() > WRITE_BUFFER {
+                    self.flush()?;
+                }
+                let Self::Disk { file, written, buffer, .. } = self else { return Ok(()) };
+                if more.len() > WRITE_BUFFER {
+                    file.write_all_at(more, *written)?;
+                    *written += more.len() as u64;
+                } else {
+                    buffer.extend_from_slice(more);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        if let Self::Disk { file, written, buffer, .. } = self {
+            file.write_all_at(buffer, *written)?;
+            *written += buffer.len() as u64;
+            buffer.clear();
+            file.flush()?;
+        }
+        Ok(())
+    }
+
+    /// Back to a length that it once had.
+    fn truncate(&mut self, len: u64) {
+        match self {
+            Self::Memory { bytes, .. } => bytes.truncate(len as usize),
+            Self::Disk { written, buffer, .. } => {
+                buffer.truncate(len.saturating_sub(*written) as usize);
+                // What lies behind in the file is written over.
+                *written = len.min(*written);
+            }
+        }
+    }
+
+    fn read(&self, offset: u64, into: &mut [u8]) -> io::Result<()> {
+        match self {
+            Self::Memory { bytes, .. } => {
+                let end = offset as usize + into.len();
+                let from = bytes.get(offset as usize..end).ok_or(io::ErrorKind::UnexpectedEof)?;
+                into.copy_from_slice(from);
+                Ok(())
+            }
+            Self::Disk { file, .. } => file.read_exact_at(into, offset),
+        }
+    }
+}
