@@ -1,1 +1,87 @@
-fn main() {}
+//! What `filter::plan` says is never exceeded, and never more than a quarter too high: measured by counting every
+//! allocation of the process. A test binary of its own, so that nothing else allocates meanwhile.
+
+use peak_alloc::PeakAlloc;
+use rpfd::filter::plan::{Shape, plan};
+use rpfd::filter::{
+    Channel, ChannelSet, Counts, Execution, Method, Plane, Rect, Role, SampleTile, TileGeometry, filter,
+};
+
+#[global_allocator]
+static ALLOCATIONS: PeakAlloc = PeakAlloc;
+
+/// Channels with so many features and random parameters.
+fn channels(features: u32, random: u32) -> ChannelSet {
+    let mut channels = vec![Channel::new("film", Role::Film, 2), Channel::new("color", Role::Color, 3)];
+    channels.extend((0..features).map(|i| Channel::new(format!("f{i}"), Role::Feature { position: i == 0 }, 3)));
+    channels.extend((0..random).map(|i| Channel::new(format!("r{i}"), Role::Random { uniform: true }, 2)));
+    ChannelSet::new(channels).expect("valid channels")
+}
+
+/// Samples that are all alive and all alike: nothing is left out or rejected, so neighbourhoods are as large as can be.
+fn planes(channels: &ChannelSet, samples: usize) -> Vec<Plane> {
+    let value = |plane: usize, i: usize| ((i * 2_654_435_761 + plane * 97) % 1009) as f32 * 1e-5;
+    (0..channels.planes()).map(|p| Plane::Values((0..samples).map(|i| value(p, i)).collect())).collect()
+}
+
+/// Peak bytes while a tile is taken in and filtered, and what the plan says.
+fn measure(
+    geometry: TileGeometry,
+    channels: ChannelSet,
+    counts: Counts,
+    method: &Method,
+    threads: usize,
+) -> (u64, u64) {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+    pool.install(|| ());
+    let pixels = geometry.window().area();
+    let (samples, most, varying) = match &counts {
+        Counts::Uniform(n) => (pixels * u64::from(*n), *n, false),
+        Counts::Varying(counts) => {
+            (counts.iter().map(|&n| u64::from(n)).sum(), counts.iter().copied().max().map_or(0, u32::from), true)
+        }
+    };
+    let shape = Shape { geometry: &geometry, channels: &channels, samples, max_per_pixel: most, varying };
+    let planned = plan(&shape, method).total(threads);
+    // The counts come in by value: they are part of the plan, but there already.
+    let given = if varying { pixels * 2 } else { 0 };
+    let before = ALLOCATIONS.current_usage() as u64;
+    ALLOCATIONS.reset_peak_usage();
+    let planes = planes(&channels, samples as usize);
+    let tile = SampleTile::new(geometry, channels.clone(), counts, planes).expect("a valid tile");
+    let execution = Execution { pool: Some(&pool), ..Execution::default() };
+    let filtered = filter(&tile, method, &execution).expect("nobody stops it");
+    assert_eq!(filtered.rgb[0].len() as u64, geometry.core().area());
+    (ALLOCATIONS.peak_usage() as u64 - before + given, planned)
+}
+
+#[test]
+fn plans_are_upper_bounds_and_tight() {
+    let tile = |image: u32, core: u32, halo: u32| {
+        let at = (image - core) / 2;
+        TileGeometry::with_halo([image, image], Rect::new(at, at, core, core), halo).expect("a valid geometry")
+    };
+    let quick = [("fractions", "0.002,0.004,0.03,0.05")];
+    let methods = [
+        Method::preset("lean").expect("a preset"),
+        Method::preset("unfiltered").expect("a preset"),
+        Method::with("paper-fast", quick).expect("valid"),
+        Method::with("lean", [("information_grid", "1"), ("bins", "31"), ("fractions", "1,1")]).expect("valid"),
+    ];
+    for method in &methods {
+        for (geometry, channels, counts) in [
+            (tile(64, 64, 0), channels(5, 3), Counts::Uniform(8)),
+            (tile(128, 48, 17), channels(6, 4), Counts::Uniform(4)),
+            (tile(96, 96, 0), channels(0, 0), Counts::Uniform(2)),
+            (tile(72, 40, 16), channels(1, 1), Counts::Varying((0..72 * 72).map(|i| (i % 7) as u16).collect())),
+        ] {
+            for threads in [1, 3] {
+                let planes = channels.planes();
+                let (peak, planned) = measure(geometry, channels.clone(), counts.clone(), method, threads);
+                let name = format!("{} of {planes} planes on {threads} threads", method.preset_name());
+                assert!(peak <= planned, "{name}: {peak} bytes where {planned} were planned");
+                assert!(planned * 4 <= peak * 5, "{name}: {planned} bytes planned, {peak} needed");
+            }
+        }
+    }
+}

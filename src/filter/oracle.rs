@@ -168,8 +168,8 @@ pub fn filter(
                         + distance(&normalised.features, &weights.beta, i, j)))
                 .exp();
                 total += w;
-                for k in 0..3 {
-                    sums[k] += w * colors[k][j];
+                for (sum, color) in sums.iter_mut().zip(colors) {
+                    *sum += w * color[j];
                 }
             }
             std::array::from_fn(|k| {

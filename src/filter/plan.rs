@@ -27,7 +27,7 @@ pub struct Plan {
     pub working: u64,
     /// What the method needs on each thread.
     pub per_thread: u64,
-    /// The filtered core.
+    /// The filtered core, and small things.
     pub output: u64,
 }
 
@@ -38,13 +38,16 @@ impl Plan {
     }
 }
 
+/// For what does not grow with the tile: names, tables, the pool's bookkeeping.
+const FIXED: u64 = 16 << 10;
+
 /// Bytes that filtering a tile of this shape will need.
 pub fn plan(shape: &Shape, method: &Method) -> Plan {
     let pixels = shape.geometry.window().area();
     // 4 bytes a value; where counts vary, a start and, while it is read, a count per pixel.
     let starts = if shape.varying { pixels * (4 + 2) + 4 } else { 0 };
     let samples = shape.samples * 4 * shape.channels.planes() as u64 + starts;
-    let output = shape.geometry.core().area() * 12;
+    let output = shape.geometry.core().area() * 12 + FIXED;
     let own = match method.algorithm() {
         Algorithm::Unfiltered => Plan::default(),
         Algorithm::Rpf(params) => super::rpf::plan(shape, params),

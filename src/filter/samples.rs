@@ -48,6 +48,15 @@ impl Channel {
     pub fn new(name: impl Into<String>, role: Role, components: u32) -> Self {
         Self { name: name.into(), role, components }
     }
+
+    /// Whether a sample whose components are all 0 has no such feature, as the papers encode it: world positions, and
+    /// the normals that everyone calls `N` and `N2`, since no normal is 0. (An albedo of 0 is black.)
+    pub fn zero_is_missing(&self) -> bool {
+        match self.role {
+            Role::Feature { position } => position || matches!(self.name.as_str(), "N" | "N2"),
+            _ => false,
+        }
+    }
 }
 
 /// Channels that cannot be; says what would be right.
@@ -291,8 +300,8 @@ pub fn sample_total(pixels: u64, counts: &Counts) -> Result<u64, SampleError> {
 
 impl SampleTile {
     /// Checks the shape and makes the values finite, in place: a colour that is not finite becomes the mean of its
-    /// pixel's finite samples in that channel (0 if there is none); NaN in a feature stays and means "none"; anything
-    /// else that is not finite becomes 0.
+    /// pixel's finite samples in that channel (0 if there is none); NaN in a feature stays and means "none", and so does
+    /// 0 where it can only mean that ([`Channel::zero_is_missing`]); anything else that is not finite becomes 0.
     ///
     /// `planes` are in the order of [`ChannelSet::plane_channels`], each with one value per sample of the data window.
     pub fn new(
@@ -335,39 +344,47 @@ impl SampleTile {
     fn sanitise(&mut self) {
         let roles: Vec<Role> = self.channels.plane_channels().map(|(channel, _)| channel.role).collect();
         for (plane, role) in self.planes.iter_mut().zip(roles) {
-            let mut constant = [0.0];
-            let (values, single) = match plane {
+            let feature = matches!(role, Role::Feature { .. });
+            let bad = |v: f32| !(v.is_finite() || v.is_nan() && feature);
+            let replaced = match plane {
                 Plane::Constant(value) => {
-                    constant[0] = *value;
-                    (&mut constant[..], true)
+                    let replaced = if bad(*value) { self.layout.total() } else { 0 };
+                    // -0 and 0 are equal, and which of them a tile meets first must not matter.
+                    *value = if bad(*value) { 0.0 } else { *value + 0.0 };
+                    replaced
                 }
-                Plane::Values(values) => (&mut values[..], false),
-            };
-            let bad = |v: f32| !v.is_finite() && !(v.is_nan() && matches!(role, Role::Feature { .. }));
-            let mut replaced = values.iter().filter(|&&v| bad(v)).count() as u64;
-            if replaced > 0 {
-                if role == Role::Color && !single {
-                    for pixel in 0..self.geometry.window().area() as usize {
-                        replace_by_mean(&mut values[self.layout.of(pixel)]);
+                Plane::Values(values) => {
+                    let replaced = values.iter().filter(|&&v| bad(v)).count();
+                    if replaced > 0 && role == Role::Color {
+                        for pixel in 0..self.geometry.window().area() as usize {
+                            replace_by_mean(&mut values[self.layout.of(pixel)]);
+                        }
                     }
-                } else {
-                    values.iter_mut().filter(|v| bad(**v)).for_each(|v| *v = 0.0);
+                    values.iter_mut().for_each(|v| *v = if bad(*v) { 0.0 } else { *v + 0.0 });
+                    replaced
                 }
-                if single {
-                    replaced = self.layout.total() as u64;
-                }
-            }
+            } as u64;
             match role {
                 Role::Color => self.replaced.color += replaced,
                 Role::Feature { .. } => self.replaced.feature += replaced,
                 Role::Random { .. } => self.replaced.random += replaced,
                 Role::Film => self.replaced.film += replaced,
             }
-            // -0 and 0 are equal, and which of them a tile meets first must not matter.
-            values.iter_mut().for_each(|v| *v += 0.0);
-            let same = |v: f32| v == values[0] || (v.is_nan() && values[0].is_nan());
-            if single || values.is_empty() || values.iter().all(|&v| same(v)) {
-                *plane = Plane::Constant(values.first().copied().unwrap_or(0.0));
+        }
+        let mut first = 0;
+        for channel in self.channels.channels() {
+            let components = channel.components as usize;
+            if channel.zero_is_missing() {
+                zero_to_missing(&mut self.planes[first..first + components], self.layout.total());
+            }
+            first += components;
+        }
+        for plane in &mut self.planes {
+            if let Plane::Values(values) = plane {
+                let first = values.first().copied().unwrap_or(0.0);
+                if values.iter().all(|&v| v == first || v.is_nan() && first.is_nan()) {
+                    *plane = Plane::Constant(first);
+                }
             }
         }
     }
@@ -422,6 +439,27 @@ impl SampleTile {
     /// What had to be made finite.
     pub const fn replaced(&self) -> Replaced {
         self.replaced
+    }
+}
+
+/// Sets samples whose components are all 0 to missing. A component that is 0 throughout may stay so: the others say it.
+fn zero_to_missing(components: &mut [Plane], samples: usize) {
+    if components.iter().all(|plane| *plane == Plane::Constant(0.0)) {
+        components.fill(Plane::Constant(f32::NAN));
+        return;
+    }
+    for sample in 0..samples {
+        let zero = |plane: &Plane| match plane {
+            Plane::Constant(value) => *value == 0.0,
+            Plane::Values(values) => values[sample] == 0.0,
+        };
+        if components.iter().all(zero) {
+            for plane in components.iter_mut() {
+                if let Plane::Values(values) = plane {
+                    values[sample] = f32::NAN;
+                }
+            }
+        }
     }
 }
 

@@ -29,13 +29,13 @@ pub(crate) struct Pass<'a> {
 
 /// What one thread works in; allocated once per tile, with [`Scratch::bytes`].
 pub(crate) struct Scratch {
-    rows: Rows,
+    pub(super) rows: Rows,
     /// Columns of the neighbourhood, `stride` apart: positions, random parameters, features, colours.
-    columns: Vec<f32>,
-    radiance: Vec<f32>,
-    stride: usize,
+    pub(super) columns: Vec<f32>,
+    pub(super) radiance: Vec<f32>,
+    pub(super) stride: usize,
     histograms: Histograms,
-    dependencies: Dependencies,
+    pub(super) dependencies: Dependencies,
     pub(crate) weights: Weights,
     active: Vec<usize>,
     /// Values that the spike step replaced in core pixels.
@@ -43,15 +43,15 @@ pub(crate) struct Scratch {
 }
 
 /// Where the columns of a role start, in [`Scratch::columns`].
-struct ColumnOrder {
-    random: usize,
-    features: usize,
-    colors: usize,
-    end: usize,
+pub(super) struct ColumnOrder {
+    pub(super) random: usize,
+    pub(super) features: usize,
+    pub(super) colors: usize,
+    pub(super) end: usize,
 }
 
 impl ColumnOrder {
-    fn of(relevant: &Relevant) -> Self {
+    pub(super) fn of(relevant: &Relevant) -> Self {
         let random = relevant.positions().len();
         let features = random + relevant.random().len();
         let colors = features + relevant.features().len();
@@ -92,7 +92,7 @@ impl Scratch {
 
 impl Pass<'_> {
     /// Draws the neighbourhood of a pixel; false if it has no samples.
-    fn gather(&self, scratch: &mut Scratch, x: u32, y: u32) -> bool {
+    pub(super) fn gather(&self, scratch: &mut Scratch, x: u32, y: u32) -> bool {
         let own = self.tile.samples_of(self.tile.geometry().window().index(x, y)).len();
         if own == 0 {
             return false;
@@ -146,7 +146,7 @@ impl Pass<'_> {
 
     /// Copies the colours into place, scaled to a safe size, and says what they span.
     #[inline(always)]
-    fn load_radiance<S: Simd>(&self, simd: S, scratch: &mut Scratch) -> [Span; 3] {
+    pub(super) fn load_radiance<S: Simd>(&self, simd: S, scratch: &mut Scratch) -> [Span; 3] {
         let rows = scratch.rows.samples.len();
         let mut channels = scratch.radiance.chunks_exact_mut(scratch.stride);
         let (Some(red), Some(green), Some(blue)) = (channels.next(), channels.next(), channels.next()) else {
@@ -189,7 +189,7 @@ impl Pass<'_> {
 
     /// Steps 2 to 4 of a gathered neighbourhood: loads every column, and sets `scratch.weights`.
     #[inline(always)]
-    fn weigh_gathered<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
+    pub(super) fn weigh_gathered<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
         let order = ColumnOrder::of(self.relevant);
         let rows = scratch.rows.samples.len();
         scratch.histograms.start(rows);
@@ -233,7 +233,15 @@ impl Pass<'_> {
 
     /// Filters the samples of one pixel into `out`; with a grid, the weights are interpolated from its nodes.
     #[inline(always)]
-    fn pixel<S: Simd>(&self, simd: S, scratch: &mut Scratch, grid: Option<&Grid>, x: u32, y: u32, out: &mut [f32]) {
+    pub(super) fn pixel<S: Simd>(
+        &self,
+        simd: S,
+        scratch: &mut Scratch,
+        grid: Option<&Grid>,
+        x: u32,
+        y: u32,
+        out: &mut [f32],
+    ) {
         if !self.gather(scratch, x, y) {
             return;
         }

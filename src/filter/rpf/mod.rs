@@ -22,6 +22,9 @@ mod spikes;
 mod statistics;
 mod weights;
 
+#[cfg(test)]
+mod tests;
+
 pub use params::Params;
 
 use super::lanes::dispatch;

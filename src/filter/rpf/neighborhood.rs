@@ -40,7 +40,8 @@ impl Offsets {
         let offset = |slot: usize| slot as i16 - radius;
         let mut slots = vec![Slot::default(); SLOTS];
         let (mut small, mut large): (Vec<usize>, Vec<usize>) = (0..SLOTS).partition(|&i| left[i] < 1.0);
-        while let (Some(low), Some(&high)) = (small.pop(), large.last()) {
+        while let Some(&high) = large.last() {
+            let Some(low) = small.pop() else { break };
             let share = libm::round(left[low] * 65536.0) as u32;
             slots[low] = Slot { share, own: offset(low), other: offset(high) };
             left[high] -= 1.0 - f64::from(share) / 65536.0;
@@ -49,10 +50,9 @@ impl Offsets {
                 small.push(high);
             }
         }
+        // What remains holds 1, but for rounding.
         for full in small.into_iter().chain(large) {
-            // Rounding can leave a slot outside the box last, by less than a 65536th: it becomes the centre's.
-            let own = if full < probabilities.len() { offset(full) } else { 0 };
-            slots[full] = Slot { share: 65536, own, other: own };
+            slots[full] = Slot { share: 65536, own: offset(full), other: offset(full) };
         }
         Self { slots }
     }
@@ -149,8 +149,7 @@ pub(crate) fn gather_rows(
         let Some((pixel, bits)) = candidate(&image, &window, offsets, center, draw) else { continue };
         let samples = tile.samples_of(pixel);
         if !samples.is_empty() {
-            let chosen = ((random::mix(bits) >> 32) * samples.len() as u64) >> 32;
-            rows.samples.push((samples.start as u64 + chosen) as u32);
+            rows.samples.push(pick_sample(bits, &samples));
             rows.pixels.push(pixel as u32);
         }
     }
@@ -163,10 +162,23 @@ pub(crate) fn gather_rows(
     }
 }
 
+/// A uniformly random one of a pixel's samples, for the bits that chose the pixel.
+#[inline(always)]
+pub(super) fn pick_sample(bits: u64, samples: &std::ops::Range<usize>) -> u32 {
+    let chosen = ((random::mix(bits) >> 32) * samples.len() as u64) >> 32;
+    (samples.start as u64 + chosen) as u32
+}
+
 /// The pixel (index in the data window) that a draw ends at, and its bits; none if all tries fail, or if it ends where
 /// the data window, for want of halo, has no samples.
 #[inline(always)]
-fn candidate(image: &Rect, window: &Rect, offsets: &Offsets, center: &Center, draw: u64) -> Option<(usize, u64)> {
+pub(super) fn candidate(
+    image: &Rect,
+    window: &Rect,
+    offsets: &Offsets,
+    center: &Center,
+    draw: u64,
+) -> Option<(usize, u64)> {
     for attempt in 0..TRIES {
         let bits = random::bits(center.key, draw * TRIES + attempt);
         let (dx, dy) = (offsets.pick(bits), offsets.pick(bits >> 24));

@@ -1,0 +1,220 @@
+//! What the core promises of the whole: same bits, exact constants, less halo, holes.
+
+use super::{method, part, scene};
+use crate::filter::geometry::tiling;
+use crate::filter::method::PRESETS;
+use crate::filter::{
+    Channel, ChannelSet, Counts, Execution, Filtered, Halo, LeftOutReason, Method, Plane, Rect, Role, SampleTile,
+    SimdLevel, Stopped, TileGeometry, filter,
+};
+use crate::synth::Scene;
+use std::sync::atomic::AtomicBool;
+
+fn run(tile: &SampleTile, method: &Method) -> Filtered {
+    filter(tile, method, &Execution { seed: 5, ..Execution::default() }).unwrap()
+}
+
+/// The methods that tiling and threads are tried with: presets as they are where their reach fits a small image, else
+/// with smaller boxes.
+fn methods() -> [Method; 3] {
+    let small = [("boxes", "15,9,7,5"), ("fractions", "0.05,0.1,0.3,0.5")];
+    [
+        method("lean", &[]),
+        method("paper-fast", &small),
+        method("paper-fast", &[small[0], small[1], ("spikes", "off"), ("information_grid", "3")]),
+    ]
+}
+
+/// Assembles an image from tiles of some size, last tile first.
+fn tiled(
+    image: [u32; 2],
+    size: u32,
+    halo: u32,
+    method: &Method,
+    tile: impl Fn(TileGeometry) -> SampleTile,
+) -> Vec<f32> {
+    let mut out = vec![f32::NAN; (image[0] * image[1] * 3) as usize];
+    let mut cores: Vec<Rect> = tiling(image, size).collect();
+    cores.reverse();
+    for core in cores {
+        let filtered = run(&tile(TileGeometry::with_halo(image, core, halo).unwrap()), method);
+        for (k, plane) in filtered.rgb.iter().enumerate() {
+            for (i, value) in plane.iter().enumerate() {
+                let (x, y) = (core.x + i as u32 % core.width, core.y + i as u32 / core.width);
+                out[((y * image[0] + x) * 3) as usize + k] = *value;
+            }
+        }
+    }
+    out
+}
+
+fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|v| v.to_bits()).collect()
+}
+
+#[test]
+fn tiles_with_enough_halo_give_the_whole_images_bits() {
+    let image = [76, 52];
+    for method in methods() {
+        let whole = tiled(image, 100, 0, &method, |geometry| part("all", geometry, 3));
+        assert!(whole.iter().all(|v| v.is_finite()));
+        for size in [76, 31, 16] {
+            let tiles = tiled(image, size, method.reach(false), &method, |geometry| part("all", geometry, 3));
+            assert!(bits(&tiles) == bits(&whole), "{method:?}, tiles of {size}");
+        }
+        // The test can fail: too little halo changes bits.
+        let tiles = tiled(image, 16, method.reach(false) / 2, &method, |geometry| part("all", geometry, 3));
+        assert!(bits(&tiles) != bits(&whole), "{method:?}");
+    }
+}
+
+#[test]
+fn varying_counts_and_holes_give_the_whole_images_bits() {
+    let image = [60, 44];
+    let tile = |geometry| Scene::by_name("all").unwrap().tile_varying(geometry, 3, &Execution::default()).unwrap();
+    for method in methods() {
+        let whole = tiled(image, 100, 0, &method, tile);
+        assert!(whole.iter().all(|v| v.is_finite()));
+        let tiles = tiled(image, 16, method.reach(true), &method, tile);
+        assert!(bits(&tiles) == bits(&whole), "{method:?}");
+        let geometry = TileGeometry::with_halo(image, Rect::new(0, 0, 60, 44), 0).unwrap();
+        let report = run(&tile(geometry), &method).report;
+        assert!(report.filled > 0, "{report:?}");
+    }
+}
+
+#[test]
+fn threads_and_simd_levels_do_not_matter() {
+    let tile = scene("all", [40, 33], 4);
+    for method in methods() {
+        let expected = run(&tile, &method);
+        for threads in [1, 2, 5] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let execution = Execution { seed: 5, pool: Some(&pool), ..Execution::default() };
+            assert_eq!(filter(&tile, &method, &execution).unwrap(), expected, "{threads} threads");
+        }
+        for (name, simd) in SimdLevel::available() {
+            let execution = Execution { seed: 5, simd, ..Execution::default() };
+            assert_eq!(filter(&tile, &method, &execution).unwrap(), expected, "{name}");
+        }
+    }
+    let other = filter(&tile, &methods()[0], &Execution { seed: 6, ..Execution::default() }).unwrap();
+    assert_ne!(other.rgb, run(&tile, &methods()[0]).rgb, "the seed matters");
+}
+
+#[test]
+fn constant_colour_stays_exactly() {
+    for (preset, _) in PRESETS {
+        let settings: &[(&str, &str)] =
+            if *preset == "paper" { &[("boxes", "15,7"), ("fractions", "0.5,0.5")] } else { &[] };
+        for value in [0.0, 0.1, 1.0 / 3.0, 1e-40, 7.7e37] {
+            let noisy = scene("all", [20, 20], 3);
+            let color = noisy.channels().color_planes();
+            let planes = (0..noisy.channels().planes())
+                .map(|plane| if color.contains(&plane) { Plane::Constant(value) } else { noisy.plane(plane).clone() })
+                .collect();
+            let tile =
+                SampleTile::new(*noisy.geometry(), noisy.channels().clone(), Counts::Uniform(3), planes).unwrap();
+            let filtered = run(&tile, &method(preset, settings));
+            assert!(filtered.rgb.iter().flatten().all(|&v| v == value), "{preset} {value}");
+        }
+    }
+}
+
+#[test]
+fn too_little_halo_is_filtered_and_said() {
+    let geometry = TileGeometry::with_halo([90, 90], Rect::new(40, 40, 10, 10), 4).unwrap();
+    let filtered = run(&part("all", geometry, 2), &method("lean", &[]));
+    assert!(!filtered.report.exact());
+    assert_eq!(filtered.report.halo_needed, Halo { left: 17, top: 17, right: 17, bottom: 17 });
+    assert!(filtered.rgb.iter().flatten().all(|v| v.is_finite()));
+}
+
+/// Adds or removes planes that cannot have an effect: constant ones and missing ones of every role.
+#[test]
+fn planes_without_effect_change_no_bit() {
+    let tile = scene("lens", [24, 24], 3);
+    let planes = |tile: &SampleTile| (0..tile.channels().planes()).map(|p| tile.plane(p).clone()).collect::<Vec<_>>();
+    let with = |extra: &[(Channel, Plane)]| {
+        let mut channels = tile.channels().channels().to_vec();
+        let mut planes = planes(&tile);
+        for (channel, plane) in extra {
+            channels.push(channel.clone());
+            planes.push(plane.clone());
+        }
+        SampleTile::new(*tile.geometry(), ChannelSet::new(channels).unwrap(), Counts::Uniform(3), planes).unwrap()
+    };
+    let feature = |name: &str, position| Channel::new(name, Role::Feature { position }, 1);
+    let random = |name: &str| Channel::new(name, Role::Random { uniform: true }, 1);
+    let extended = with(&[
+        (feature("depth", false), Plane::Constant(1e30)),
+        (feature("P3", true), Plane::Constant(f32::NAN)),
+        (random("wavelength"), Plane::Values(vec![0.25; tile.total()])),
+    ]);
+    for method in methods() {
+        let (plain, extended) = (run(&tile, &method), run(&extended, &method));
+        assert_eq!(plain.rgb, extended.rgb);
+        let reason = |name: &str| extended.report.left_out.iter().find(|l| l.plane == name).map(|l| l.reason);
+        assert_eq!(reason("depth"), Some(LeftOutReason::Constant));
+        assert_eq!(reason("P3"), Some(LeftOutReason::Missing));
+        assert_eq!(reason("wavelength"), Some(LeftOutReason::Constant));
+        assert_eq!(reason("time"), Some(LeftOutReason::Constant));
+    }
+}
+
+/// The plainest tiles there are: no film, no features, no random parameters; one or no sample; one pixel.
+#[test]
+fn the_smallest_tiles_filter() {
+    let color = || ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+    let tile = |size: [u32; 2], counts: Counts, samples: usize| {
+        let geometry = TileGeometry::new(size, Rect::new(0, 0, size[0], size[1]), Halo::default()).unwrap();
+        let plane = |k: usize| Plane::Values((0..samples).map(|i| ((i * 7 + k) % 5) as f32).collect());
+        SampleTile::new(geometry, color(), counts, (0..3).map(plane).collect()).unwrap()
+    };
+    for (preset, _) in PRESETS {
+        for tile in [
+            tile([1, 1], Counts::Uniform(1), 1),
+            tile([1, 9], Counts::Uniform(2), 18),
+            tile([5, 4], Counts::Uniform(0), 0),
+            tile([2, 2], Counts::Varying(vec![0, 3, 0, 1]), 4),
+        ] {
+            let filtered = run(&tile, &method(preset, &[]));
+            assert!(filtered.rgb.iter().flatten().all(|v| v.is_finite()));
+            assert_eq!(filtered.report.samples as usize, tile.total());
+        }
+    }
+    let empty = run(&tile([5, 4], Counts::Uniform(0), 0), &method("lean", &[]));
+    assert_eq!(empty.report.unfilled, 20);
+    assert!(empty.rgb.iter().flatten().all(|&v| v == 0.0));
+}
+
+/// Colours at the ends of f32, alone and many, leave every pixel finite and within what went in.
+#[test]
+fn extreme_colours_stay_finite() {
+    let noisy = scene("all", [24, 24], 4);
+    for (extreme, every) in [(1e4, 97), (1e20, 97), (f32::MAX, 97), (f32::MAX, 2), (-f32::MAX, 5), (1e-42, 3)] {
+        let color = noisy.channels().color_planes();
+        let planes = (0..noisy.channels().planes()).map(|plane| match noisy.plane(plane) {
+            Plane::Values(values) if color.contains(&plane) => Plane::Values(
+                values.iter().enumerate().map(|(i, &v)| if i % every == 0 { extreme } else { v }).collect(),
+            ),
+            other => other.clone(),
+        });
+        let tile =
+            SampleTile::new(*noisy.geometry(), noisy.channels().clone(), Counts::Uniform(4), planes.collect()).unwrap();
+        for method in methods() {
+            let filtered = run(&tile, &method);
+            assert!(filtered.rgb.iter().flatten().all(|v| v.is_finite()), "{extreme:e} every {every}");
+        }
+    }
+}
+
+#[test]
+fn a_stop_flag_ends_the_work() {
+    let stop = AtomicBool::new(true);
+    let tile = scene("all", [16, 16], 2);
+    for (preset, _) in PRESETS {
+        let execution = Execution { stop: Some(&stop), ..Execution::default() };
+        assert_eq!(filter(&tile, &method(preset, &[]), &execution), Err(Stopped));
+    }
+}
