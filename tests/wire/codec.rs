@@ -79,7 +79,7 @@ fn a_header_of_another_tile_is_refused() {
     assert_eq!(error.kind(), std::io::ErrorKind::InvalidInput);
 }
 
-/// Every message of the manifest, a tile stream of several tiles, and random cuts of it.
+/// A stream of two tiles, in equal pieces, in pieces of random sizes, and cut off anywhere.
 #[test]
 fn every_chunking_gives_the_same_tiles() {
     let mut random = Random(5);
@@ -105,9 +105,6 @@ fn every_chunking_gives_the_same_tiles() {
         let expected = if complete { "ok" } else { "truncated" };
         let result = read_raw(&stream[..end], || 1 + random.below(99) as usize);
         assert_eq!(result.map_or_else(|error| error.code(), |_| "ok"), expected, "cut at {end}");
-        if end > 600 && end + 600 < stream.len() && end % 97 != 0 {
-            continue;
-        }
     }
 }
 

@@ -108,3 +108,19 @@ fn the_python_client_reads_our_results() {
         assert!(String::from_utf8_lossy(&output.stderr).contains(wanted));
     }
 }
+
+/// Real renders, written by another client, where `RPFD_DATA` names their folder.
+#[test]
+fn real_renders_are_read() {
+    let Some(folder) = std::env::var_os("RPFD_DATA") else {
+        eprintln!("SKIPPED: RPFD_DATA is not set");
+        return;
+    };
+    let paths = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let tiles = |path: &std::path::PathBuf| path.to_string_lossy().contains(".tiles");
+    // The smallest is enough: the others are made by the same program.
+    let path = paths.filter(tiles).min_by_key(|path| std::fs::metadata(path).unwrap().len()).unwrap();
+    let summary = rpfd::wire::scan::scan(&path).unwrap();
+    assert!(summary.whole(), "{}", path.display());
+    assert!(summary.samples > 0 && summary.max_per_pixel > 0 && !summary.varying);
+}
