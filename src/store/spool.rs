@@ -7,8 +7,9 @@
 //!
 //! [`scan`](crate::wire::scan) says how many bytes a file will take before anything is written.
 
-use std::{fs::File, io, io::Write, os::unix::fs::FileExt, path::Path};
+use std::{io, path::Path};
 
+use super::backing::Backing;
 use crate::{
     filter::{
         ChannelSet, Counts, Plane, Rect, SampleTile, TileGeometry,
@@ -19,9 +20,6 @@ use crate::{
         value::{CountReader, ValueReader},
     },
 };
-
-/// Bytes that are collected before they are written to a file.
-const WRITE_BUFFER: usize = 256 << 10;
 
 /// A spool that cannot take or give samples; says why.
 #[derive(Debug, thiserror::Error)]
@@ -166,14 +164,12 @@ impl Open {
 impl Spool {
     /// A spool in memory: one block of `bytes` is reserved now, and more than that refused.
     pub fn in_memory(bytes: u64) -> Self {
-        let limit = usize::try_from(bytes).unwrap_or(usize::MAX);
-        Self::new(Backing::Memory { bytes: Vec::with_capacity(limit), limit: bytes })
+        Self::new(Backing::in_memory(bytes))
     }
 
     /// A spool in an unlinked file in this folder, of at most `limit` bytes.
     pub fn on_disk(folder: &Path, limit: u64) -> Result<Self, SpoolError> {
-        let file = tempfile::tempfile_in(folder)?;
-        Ok(Self::new(Backing::Disk { file, written: 0, buffer: Vec::with_capacity(WRITE_BUFFER), limit }))
+        Ok(Self::new(Backing::on_disk(folder, limit)?))
     }
 
     fn new(backing: Backing) -> Self {
@@ -500,78 +496,4 @@ impl Layout {
 
 fn sum(counts: &[u16]) -> usize {
     counts.iter().map(|&n| usize::from(n)).sum()
-}
-
-/// The bytes of a spool.
-#[derive(Debug)]
-enum Backing {
-    Memory { bytes: Vec<u8>, limit: u64 },
-    Disk { file: File, written: u64, buffer: Vec<u8>, limit: u64 },
-}
-
-impl Backing {
-    const fn len(&self) -> u64 {
-        match self {
-            Self::Memory { bytes, .. } => bytes.len() as u64,
-            Self::Disk { written, buffer, .. } => *written + buffer.len() as u64,
-        }
-    }
-
-    fn append(&mut self, more: &[u8]) -> Result<(), SpoolError> {
-        let (Self::Memory { limit, .. } | Self::Disk { limit, .. }) = self;
-        let limit = *limit;
-        if self.len().checked_add(more.len() as u64).is_none_or(|len| len > limit) {
-            return Err(SpoolError::Full { limit });
-        }
-        match self {
-            Self::Memory { bytes, .. } => bytes.extend_from_slice(more),
-            Self::Disk { buffer, .. } => {
-                if buffer.len() + more.len() > WRITE_BUFFER {
-                    self.flush()?;
-                }
-                let Self::Disk { file, written, buffer, .. } = self else { return Ok(()) };
-                if more.len() > WRITE_BUFFER {
-                    file.write_all_at(more, *written)?;
-                    *written += more.len() as u64;
-                } else {
-                    buffer.extend_from_slice(more);
-                }
-            }
-        }
-        Ok(())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        if let Self::Disk { file, written, buffer, .. } = self {
-            file.write_all_at(buffer, *written)?;
-            *written += buffer.len() as u64;
-            buffer.clear();
-            file.flush()?;
-        }
-        Ok(())
-    }
-
-    /// Back to a length that it once had.
-    fn truncate(&mut self, len: u64) {
-        match self {
-            Self::Memory { bytes, .. } => bytes.truncate(len as usize),
-            Self::Disk { written, buffer, .. } => {
-                buffer.truncate(len.saturating_sub(*written) as usize);
-                // What lies behind in the file is written over.
-                *written = len.min(*written);
-            }
-        }
-    }
-
-    fn read(&self, offset: u64, into: &mut [u8]) -> io::Result<()> {
-        match self {
-            Self::Memory { bytes, .. } => {
-                let end = offset as usize + into.len();
-                let from = bytes.get(offset as usize..end).ok_or(io::ErrorKind::UnexpectedEof)?;
-                into.copy_from_slice(from);
-                Ok(())
-            }
-            Self::Disk { file, .. } => file.read_exact_at(into, offset),
-        }
-    }
 }

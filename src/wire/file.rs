@@ -25,7 +25,7 @@ pub struct FileError {
     /// The file.
     pub path: PathBuf,
     /// What is wrong with it.
-    pub fault: FileFault,
+    pub fault: Box<FileFault>,
 }
 
 /// What is wrong with a file.
@@ -47,9 +47,13 @@ pub enum FileFault {
 }
 
 impl FileError {
+    fn io(path: PathBuf, error: io::Error) -> Self {
+        Self { path, fault: Box::new(FileFault::Io(error)) }
+    }
+
     /// A stable word for the kind of fault: that of the [`WireError`], or `not_found`, `io`, `truncated`, `compression`.
     pub fn code(&self) -> &'static str {
-        match &self.fault {
+        match &*self.fault {
             FileFault::Io(error) if error.kind() == io::ErrorKind::NotFound => "not_found",
             FileFault::Io(_) => "io",
             FileFault::Compression(error) if error.kind() == io::ErrorKind::UnexpectedEof => "truncated",
@@ -77,7 +81,7 @@ impl TileFile {
         let path = path.into();
         match File::open(&path) {
             Ok(file) => Self::from_reader(path, file),
-            Err(error) => Err(FileError { path, fault: FileFault::Io(error) }),
+            Err(error) => Err(FileError::io(path, error)),
         }
     }
 
@@ -103,7 +107,7 @@ impl TileFile {
                 let (buffer, decoder) = (vec![0; BUFFER], Decoder::new());
                 Ok(Self { path, source, compressed, buffer, start: 0, end: 0, decoder })
             }
-            Err(error) => Err(FileError { path, fault: FileFault::Io(error) }),
+            Err(error) => Err(FileError::io(path, error)),
         }
     }
 
@@ -173,7 +177,7 @@ impl TileFile {
     }
 
     fn fail(&self, fault: FileFault) -> FileError {
-        FileError { path: self.path.clone(), fault }
+        FileError { path: self.path.clone(), fault: Box::new(fault) }
     }
 }
 
@@ -203,7 +207,7 @@ impl TileWriter {
         let path = path.into();
         match Self::start(&path) {
             Ok((out, temporary)) => Ok(Self { path, out, temporary }),
-            Err(error) => Err(FileError { path, fault: FileFault::Io(error) }),
+            Err(error) => Err(FileError::io(path, error)),
         }
     }
 
@@ -229,8 +233,7 @@ impl TileWriter {
 
     /// Writes a tile.
     pub fn write_tile(&mut self, header: &Header, tile: &SampleTile) -> Result<(), FileError> {
-        encode_tile(header, tile, self)
-            .map_err(|error| FileError { path: self.path.clone(), fault: FileFault::Io(error) })
+        encode_tile(header, tile, self).map_err(|error| FileError::io(self.path.clone(), error))
     }
 
     /// Writes what is left, sees it on the disk, and gives the file its name.
@@ -247,7 +250,7 @@ impl TileWriter {
             }
             Ok(())
         })();
-        finished.map_err(|error| FileError { path, fault: FileFault::Io(error) })
+        finished.map_err(|error| FileError::io(path, error))
     }
 }
 

@@ -1,0 +1,137 @@
+#!/usr/bin/env python3
+"""A minimal client of tile.md: writes tiles, posts them, reads results. Needs NumPy and msgpack, nothing else.
+
+  rpfd_client.py post URL IN.tiles OUT.npy     filter the tiles of a file (URL: http://host:port/v1/filter?preset=NAME)
+  rpfd_client.py image RESULTS.msgpack OUT.npy stitch results that are in a file
+  rpfd_client.py info IN.tiles                 print every header, and each plane's sum
+  rpfd_client.py example OUT.tiles             write a small noisy image in four haloed tiles
+"""
+import json
+import sys
+import urllib.error
+import urllib.request
+
+import msgpack
+import numpy as np
+
+COLOR = {"name": "color", "role": "color", "components": 3}
+FILM = {"name": "film", "role": "film", "components": 2}
+
+
+def formats(header):
+    """The NumPy types of a tile's planes, in order."""
+    for channel in header["channels"]:
+        half = channel["role"] != "film" and channel.get("format", header["format"]) == "f16"
+        yield from ["<f2" if half else "<f4"] * channel["components"]
+
+
+def pack_tile(header, planes, counts=None):
+    """A tile as bytes. `planes`: one array a component, of the samples of the data window, pixels row by row and the
+    samples of a pixel next to each other, in any shape with that order; or one number for a constant plane. `counts`:
+    the samples of each pixel, if header["samples"] is "varying"."""
+    parts = [msgpack.packb(header)]
+    if counts is not None:
+        parts.append(msgpack.packb(np.asarray(counts, "<u2").tobytes()))
+    for plane, dtype in zip(planes, formats(header), strict=True):
+        number = isinstance(plane, (int, float))
+        parts.append(msgpack.packb(plane if number else np.asarray(plane, dtype).tobytes()))
+    return b"".join(parts)
+
+
+def read_tiles(file):
+    """Yields (header, counts or None, planes): each plane a flat array of f32, or a number."""
+    stream = msgpack.Unpacker(file, max_buffer_size=1 << 32)
+    for header in stream:
+        counts = np.frombuffer(next(stream), "<u2") if header["samples"] == "varying" else None
+        planes = [next(stream) for _ in formats(header)]
+        yield header, counts, [plane if isinstance(plane, (int, float)) else np.frombuffer(plane, dtype).astype("f4")
+                               for plane, dtype in zip(planes, formats(header))]
+
+
+def read_results(file):
+    """Yields (message, planes): for a "result" its three planes, height x width; for others none. Messages of other
+    types are skipped. Raises EOFError if the stream ends without its "end"."""
+    stream = msgpack.Unpacker(file, max_buffer_size=1 << 32)
+    for message in stream:
+        kind = message.get("type") if isinstance(message, dict) else None
+        if kind == "result":
+            _, _, width, height = message["tile"]
+            yield message, [np.frombuffer(next(stream), "<f4").reshape(height, width) for _ in range(3)]
+        elif kind in ("error", "end"):
+            yield message, []
+            if kind == "end":
+                return
+    raise EOFError("the result stream was cut: it has no end")
+
+
+def stitch(results):
+    """The image (height x width x 3, NaN where nothing came) and the error messages of a result stream."""
+    image, errors = None, []
+    for message, planes in results:
+        if message["type"] == "error":
+            errors.append(message)
+        elif message["type"] == "result":
+            if image is None:
+                width, height = message["image"]
+                image = np.full((height, width, 3), np.nan, "f4")
+            x, y, w, h = message["tile"]
+            image[y:y + h, x:x + w] = np.stack(planes, -1)
+    return image, errors
+
+
+def post(url, body):
+    """Posts a tile stream (bytes, or an open file) and returns the answer to read results from."""
+    request = urllib.request.Request(url, body, {"Content-Type": "application/msgpack"}, method="POST")
+    try:
+        return urllib.request.urlopen(request)
+    except urllib.error.HTTPError as error:
+        raise SystemExit(f"{error.code} {error.reason}: {error.read().decode(errors='replace')}") from None
+
+
+def example(side=16, halo=4, samples=4):
+    """Tiles of a noisy gradient."""
+    random = np.random.default_rng(1)
+    lens = random.random((side, side, samples), dtype="f4")
+    y, x = np.mgrid[:side, :side].astype("f4")[..., None] + np.zeros((1, 1, 1, samples), "f4")
+    planes = [x + 0.5, y + 0.5, x / side + lens, y / side + lens, lens, lens]
+    channels = [FILM, COLOR, {"name": "lens", "role": "random", "components": 2}]
+    half = side // 2
+    for cy in (0, half):
+        for cx in (0, half):
+            left, top = min(halo, cx), min(halo, cy)
+            right, bottom = min(halo, side - half - cx), min(halo, side - half - cy)
+            header = {"type": "tile", "version": 1, "image": [side, side], "tile": [cx, cy, half, half],
+                      "halo": [left, top, right, bottom], "samples": samples, "format": "f32", "channels": channels}
+            window = np.s_[cy - top:cy + half + bottom, cx - left:cx + half + right]
+            yield pack_tile(header, [plane[window] for plane in planes] + [0.5])
+
+
+def main(command=None, *args):
+    if command == "post" and len(args) == 3:
+        with open(args[1], "rb") as file:
+            image, errors = stitch(read_results(post(args[0], file.read())))
+    elif command == "image" and len(args) == 2:
+        with open(args[0], "rb") as file:
+            image, errors = stitch(read_results(file))
+    elif command == "info" and len(args) == 1:
+        with open(args[0], "rb") as file:
+            for header, counts, planes in read_tiles(file):
+                sums = [float(np.sum(plane, dtype="f8")) for plane in planes]
+                print(json.dumps({**header, "sums": sums, "counts": None if counts is None else int(counts.sum())}))
+        return None
+    elif command == "example" and len(args) == 1:
+        with open(args[0], "wb") as file:
+            file.writelines(example())
+        return None
+    else:
+        return __doc__
+    for error in errors:
+        print(json.dumps(error), file=sys.stderr)
+    if image is None:
+        return "no results"
+    np.save(args[-1], image)
+    return 1 if errors else None
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
