@@ -1,5 +1,6 @@
 //! The integration tests: one binary, one module for each part of the program.
 #![expect(clippy::unwrap_used, reason = "a failed unwrap fails the test, in helpers too")]
 
+mod quality;
 mod stitch;
 mod wire;
