@@ -18,14 +18,13 @@
 //!
 //! | paper | here |
 //! |---|---|
-//! | p, r, f, c | film position, random parameters, features, colour ([`samples::Role`]) |
-//! | P, N, M | pixel, neighbourhood, its wanted size  |
-//! | b, t | box width, iteration |
-//! | I(X, Y) | mutual information, in nats  |
-//! | D_c^r, D_c^p, D_c^f, D_f^r, D_f^p | sums of information |
-//! | alpha, beta | `color_weights`, `feature_weights` ([`rpf::weights::Weights`]) |
-//! | W_c^r | `color_on_random` |
-//! | sigma_8^2 | `sigma8_squared` |
+//! | p, r, f, c | film position, random parameters, features, colour: [`Role`] |
+//! | P, N, M | pixel, neighbourhood, its wanted size: `rpf/neighborhood.rs` |
+//! | b, t | box width, iteration: [`rpf::Params`] |
+//! | I(X, Y) | mutual information, in nats: `rpf/information.rs` |
+//! | D_c^r, D_c^p, D_c^f, D_f^r, D_f^p | `Dependencies` in `rpf/weights.rs` |
+//! | alpha, beta, (1 - W_c^r)^2 | `color`, `features`, `confidence` of `Weights` in `rpf/weights.rs` |
+//! | sigma_8^2 | [`rpf::Params::sigma8_squared`] |
 
 pub mod baseline;
 pub mod geometry;

@@ -2,13 +2,13 @@
 //!
 //! | step | file |
 //! |---|---|
-//! | 1 neighbourhood | [`neighborhood`] |
-//! | 2 normalising | [`statistics`] |
-//! | 3 dependencies | [`information`] |
-//! | 4 weights | [`weights`], [`grid`] |
-//! | 5 filter | [`bilateral`] |
-//! | 6 spikes | [`spikes`] |
-//! | iterations | [`iteration`], and this file |
+//! | 1 neighbourhood | `neighborhood.rs` |
+//! | 2 normalising | `statistics.rs` |
+//! | 3 dependencies | `information.rs` |
+//! | 4 weights | `weights.rs`, `grid.rs` |
+//! | 5 filter | `bilateral.rs` |
+//! | 6 spikes | `spikes.rs` |
+//! | iterations | `iteration.rs` (one pass), and this file |
 
 mod bilateral;
 mod grid;
