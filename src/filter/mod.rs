@@ -27,6 +27,7 @@
 //! | sigma_8^2 | [`rpf::Params::sigma8_squared`] |
 
 pub mod baseline;
+pub mod coverage;
 pub mod geometry;
 mod lanes;
 pub mod method;
@@ -35,6 +36,7 @@ pub mod plan;
 pub mod rpf;
 pub mod samples;
 
+pub use coverage::Coverage;
 pub use geometry::{Halo, Rect, TileGeometry};
 pub use lanes::SimdLevel;
 pub use method::{Method, ParameterError};

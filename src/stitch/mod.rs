@@ -1,6 +1,5 @@
 //! The image being assembled: filtered cores in, in any order; an EXR out.
 //!
-//! - [`coverage`]: which cores have come and what is missing.
 //! - [`canvas`]: their pixels, in a file.
 //! - [`exr`]: the finished image as OpenEXR; reference images.
 //! - [`atomic`]: files that are complete or not there.
@@ -23,18 +22,16 @@
 
 pub mod atomic;
 pub mod canvas;
-pub mod coverage;
 pub mod exr;
 
 pub use canvas::{Canvas, CanvasError, Pixels, RgbImage};
 pub use exr::{ExrCompression, ExrError, ExrLayout, ExrOptions, ExrSamples, ExrSummary};
 
 use crate::filter::{
-    Filtered, Rect, Report, TileGeometry,
+    Coverage, Filtered, Rect, Report, TileGeometry,
     geometry::{GeometryError, Halo},
     samples::Replaced,
 };
-use coverage::Coverage;
 use std::{
     path::Path,
     sync::{Arc, Weak},
@@ -233,8 +230,7 @@ impl Stitcher {
 
     /// An image on a given canvas, none of whose pixels count yet: see [`Self::restore`].
     pub fn on(canvas: Canvas) -> Self {
-        let Rect { width, height, .. } = canvas.image();
-        Self { coverage: Coverage::new(width, height), canvas, done: 0, turn: 0 }
+        Self { coverage: Coverage::default(), canvas, done: 0, turn: 0 }
     }
 
     /// Asks whether a core, made from samples with this digest, is wanted.
@@ -255,7 +251,7 @@ impl Stitcher {
                 return Err(StitchError::Busy(core));
             }
         } else {
-            self.coverage.insert(core, Entry::default());
+            self.insert(core, Entry::default())?;
         }
         self.turn += 1;
         let claim = Claim { core, digest, replace, turn: self.turn, alive: Arc::new(()) };
@@ -302,16 +298,20 @@ impl Stitcher {
         if self.coverage.get(&core).is_some() {
             return Err(StitchError::Conflict(core));
         }
-        self.coverage.insert(core, Entry { stored: Some(Stored { digest, turn: 0, report }), pending: Vec::new() });
+        self.insert(core, Entry { stored: Some(Stored { digest, turn: 0, report }), pending: Vec::new() })?;
         self.done += core.area();
         Ok(())
+    }
+
+    fn insert(&mut self, core: Rect, entry: Entry) -> Result<(), StitchError> {
+        self.coverage.insert(core, entry).map_err(|other| StitchError::Overlap { core, other })
     }
 
     /// Refuses a core outside the image or across others; forgets claims that were given up on the way.
     fn check(&mut self, core: Rect) -> Result<(), StitchError> {
         let Rect { width, height, .. } = self.image();
         TileGeometry::new([width, height], core, Halo::default())?;
-        for other in self.coverage.overlapping(&core) {
+        for other in self.coverage.meeting(&core).into_iter().filter(|other| *other != core) {
             let entry = self.coverage.get_mut(&other);
             if entry.is_some_and(|entry| {
                 entry.forget_dead();
@@ -325,8 +325,8 @@ impl Stitcher {
     }
 
     /// The image as a rectangle at (0, 0).
-    pub const fn image(&self) -> Rect {
-        self.coverage.image()
+    pub fn image(&self) -> Rect {
+        self.canvas.image()
     }
 
     /// The canvas. Where pixels are missing it may hold remains of an interrupted write: see [`Self::pixels`].
@@ -340,13 +340,13 @@ impl Stitcher {
     }
 
     /// Whether every pixel is stored.
-    pub const fn is_complete(&self) -> bool {
+    pub fn is_complete(&self) -> bool {
         self.done == self.image().area()
     }
 
     /// The pixels that are not stored, as few rectangles, by rows. They do not depend on the order of arrival.
     pub fn missing(&self) -> Vec<Rect> {
-        coverage::gaps(self.image(), self.tiles().map(|(core, _)| core))
+        self.coverage.missing_but(&self.image(), |entry| entry.stored.is_some())
     }
 
     /// The stored tiles by rows, with their reports.

@@ -12,11 +12,11 @@ use std::{io, path::Path};
 use super::backing::Backing;
 use crate::{
     filter::{
-        ChannelSet, Counts, Plane, Rect, SampleTile, TileGeometry,
+        ChannelSet, Counts, Coverage, Plane, Rect, SampleTile, TileGeometry,
         samples::{SampleError, sample_total},
     },
     wire::{
-        Coverage, Event, Format, Header, SampleCounts,
+        Event, Format, Header, SampleCounts,
         value::{CountReader, ValueReader},
     },
 };
@@ -259,8 +259,8 @@ impl Spool {
                 return disagreement("the channels");
             }
         }
-        if let Some((other, _)) = self.tiles.meeting(&tile).next() {
-            return Err(SpoolError::Overlap { tile, other: *other });
+        if let Some(&other) = self.tiles.meeting(&tile).first() {
+            return Err(SpoolError::Overlap { tile, other });
         }
         let before = self.backing.len();
         let samples = match header.samples() {
@@ -296,7 +296,7 @@ impl Spool {
 
     /// Cores that are there.
     pub fn tiles(&self) -> impl Iterator<Item = Rect> {
-        self.tiles.items().iter().map(|(core, _)| *core)
+        self.tiles.iter().map(|(core, _)| core)
     }
 
     /// The parts of a window that no tile has brought, as rectangles that do not overlap.
@@ -320,7 +320,8 @@ impl Spool {
         if !missing.is_empty() {
             return Err(SpoolError::Missing { window, missing });
         }
-        let parts: Vec<&(Rect, Stored)> = self.tiles.meeting(&window).collect();
+        let meeting = self.tiles.meeting(&window);
+        let parts: Vec<_> = meeting.into_iter().filter_map(|core| Some((core, self.tiles.get(&core)?))).collect();
         let layout = self.layout(&window, &parts)?;
         let planes = (0..channels.planes()).map(|plane| self.plane(&window, &parts, &layout, plane));
         let planes = planes.collect::<Result<Vec<_>, _>>()?;
@@ -328,7 +329,7 @@ impl Spool {
     }
 
     /// Where each pixel's samples go.
-    fn layout(&self, window: &Rect, parts: &[&(Rect, Stored)]) -> Result<Layout, SpoolError> {
+    fn layout(&self, window: &Rect, parts: &[(Rect, &Stored)]) -> Result<Layout, SpoolError> {
         let mut uniform = parts.iter().map(|(_, stored)| match stored.samples {
             StoredSamples::Uniform(n) => Some(n),
             StoredSamples::Varying { .. } => None,
@@ -379,7 +380,7 @@ impl Spool {
     fn plane(
         &self,
         window: &Rect,
-        parts: &[&(Rect, Stored)],
+        parts: &[(Rect, &Stored)],
         layout: &Layout,
         plane: usize,
     ) -> Result<Plane, SpoolError> {

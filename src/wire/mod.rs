@@ -13,7 +13,6 @@
 //! - the first error ends it: every later call returns the same one.
 
 pub mod assemble;
-pub mod coverage;
 pub mod decoder;
 pub mod encoder;
 pub mod error;
@@ -28,7 +27,6 @@ mod token;
 pub mod value;
 
 pub use assemble::Assembler;
-pub use coverage::Coverage;
 pub use decoder::{Decoder, Event};
 pub use encoder::{encode_header, encode_tile};
 pub use error::{Fault, WireError};

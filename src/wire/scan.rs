@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 
 use super::{
-    Coverage, Event, Format, Header,
+    Event, Format, Header,
     file::{FileError, TileFile},
     value::{CountReader, ValueReader},
 };
-use crate::filter::{Rect, TileGeometry};
+use crate::filter::{Coverage, Rect, TileGeometry};
 
 /// What is in a file of tiles.
 #[derive(Clone, Debug)]
