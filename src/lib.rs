@@ -10,11 +10,14 @@
 //! - `report`: how far an image is from its reference.
 //! - `store`: samples on disk, from which tiles of any size are cut.
 //! - `wire`: tiles and results as MessagePack, without I/O, and files of tiles.
+//! - `config`: what is set by words, like sizes in bytes.
 //! - `cli`: the `rpfd` command, one file per subcommand.
 #![forbid(unsafe_code)]
 
 #[cfg(feature = "program")]
 pub mod cli;
+#[cfg(feature = "program")]
+pub mod config;
 pub mod filter;
 #[cfg(feature = "program")]
 pub mod picture;
