@@ -10,12 +10,15 @@
 //! - `report`: how far an image is from its reference.
 //! - `store`: samples on disk, from which tiles of any size are cut.
 //! - `wire`: tiles and results as MessagePack, without I/O, and files of tiles.
+//! - `client`: HTTP client of the service, with retries.
 //! - `config`: what is set by words, like sizes in bytes.
 //! - `cli`: the `rpfd` command, one file per subcommand.
 #![forbid(unsafe_code)]
 
 #[cfg(feature = "program")]
 pub mod cli;
+#[cfg(feature = "program")]
+pub mod client;
 #[cfg(feature = "program")]
 pub mod config;
 pub mod filter;

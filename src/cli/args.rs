@@ -86,6 +86,14 @@ fn names<T>(names: &[(&'static str, T)]) -> clap::builder::PossibleValuesParser 
 }
 
 impl ExrArgs {
+    /// As the service takes them.
+    pub(crate) fn query(&self) -> Vec<(&'static str, String)> {
+        let samples = if self.half { "half" } else { &self.exr_samples };
+        let mut query = vec![("samples", samples.to_owned()), ("compression", self.compression.clone())];
+        query.extend(self.exr_tiles.map(|size| ("tile", size.to_string())));
+        query
+    }
+
     /// As the writer takes them; metadata says how the image was made.
     pub(crate) fn options(&self, method: &Method, seed: u64) -> ExrOptions {
         let samples = if self.half { "half" } else { &self.exr_samples };

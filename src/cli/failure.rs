@@ -1,6 +1,7 @@
 //! Why a command did not do what it was asked to.
 
 use crate::{
+    client::ClientError,
     filter::{ParameterError, Rect, Stopped},
     picture::PictureError,
     stitch::{CanvasError, ExrError, StitchError, atomic::AtomicError},
@@ -34,7 +35,7 @@ pub(crate) enum FailureKind {
 
 impl Failure {
     pub(crate) fn new(kind: FailureKind, code: impl Into<String>, message: impl std::fmt::Display) -> Self {
-        Self { kind, code: code.into(), message: message.to_string() }
+        Self { kind, code: code.into().replace('-', "_"), message: message.to_string() }
     }
 
     pub(crate) fn failed(code: impl Into<String>, message: impl std::fmt::Display) -> Self {
@@ -108,6 +109,18 @@ impl From<SynthError> for Failure {
             SynthError::Stopped => Stopped.into(),
             other => Self::usage("too_large", other),
         }
+    }
+}
+
+impl From<ClientError> for Failure {
+    fn from(error: ClientError) -> Self {
+        let kind = match error {
+            ClientError::Refused { .. } => FailureKind::Refused,
+            ClientError::Url(_) => FailureKind::Usage,
+            ClientError::Stopped => return Stopped.into(),
+            _ => FailureKind::Failed,
+        };
+        Self::new(kind, error.code(), &error)
     }
 }
 

@@ -9,6 +9,7 @@ mod failure;
 mod filter;
 mod input;
 mod inspect;
+mod post;
 mod progress;
 mod schedule;
 mod synth;
@@ -34,8 +35,9 @@ Examples:
 
 #[derive(clap::Subcommand)]
 enum Command {
-    Filter(filter::Args),
+    Filter(Box<filter::Args>),
     Inspect(inspect::Args),
+    Post(Box<post::Args>),
     Synth(synth::Args),
 }
 
@@ -44,6 +46,7 @@ pub fn main() -> ExitCode {
     let (json, result) = match Cli::parse().command {
         Command::Filter(args) => (args.json, filter::run(&args)),
         Command::Inspect(args) => (args.json, inspect::run(&args)),
+        Command::Post(args) => (args.json, post::run(&args)),
         Command::Synth(args) => (args.json, synth::run(&args)),
     };
     match result {

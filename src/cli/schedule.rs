@@ -49,14 +49,14 @@ impl Schedule {
         let cost = |shape: &Shape| plan(shape, method).total(threads);
         let summary = &input.summary;
         let planes = summary.first.channels().planes() as u64;
-        let records = |tiles: u64| tiles * (PER_TILE + PER_PLANE * planes) + BUFFERS + summary.window_bytes;
+        let records = |tiles: u64| tiles * (PER_TILE + PER_PLANE * planes) + BUFFERS;
         let ready = summary.tiles.iter().all(|tile| {
             let needed = tile.geometry.halo_for(method.reach(tile.varying));
             tile.geometry.halo().covers(&needed)
         });
         if ready {
             let largest = summary.tiles.iter().map(|tile| cost(&input.shape_of(tile))).max().unwrap_or(0);
-            let bytes = largest + records(summary.tiles.len() as u64);
+            let bytes = largest + records(summary.tiles.len() as u64) + summary.window_bytes;
             if bytes <= memory.0 {
                 return Ok(Self { way: Way::AsTheyCome, bytes });
             }
@@ -72,6 +72,8 @@ impl Schedule {
                 largest = largest.max(cost(&input.shape(&geometry)));
                 cores += 1;
             }
+            // While the file is read no tile is there yet.
+            let largest = largest.max(summary.window_bytes);
             let bytes = largest + records(cores + summary.tiles.len() as u64) + 8 * rows;
             least = least.min(bytes);
             if bytes > memory.0 {

@@ -3,7 +3,7 @@
 use super::{
     args::{ThreadArgs, size},
     failure::Failure,
-    filter::write_exr,
+    filter::{folder_of, write_exr},
     progress,
 };
 use crate::{
@@ -144,8 +144,7 @@ fn reference(args: &Args, scene: &Scene, execution: &Execution, path: &std::path
     /// Side of the parts that are in memory at a time.
     const PART: u32 = 128;
     let [width, height] = args.size;
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(std::path::Path::new("."));
-    let mut stitcher = Stitcher::new(width, height, folder)?;
+    let mut stitcher = Stitcher::new(width, height, folder_of(path))?;
     let bar = progress::bar("reference", u64::from(width) * u64::from(height));
     let mut errors = [0.0; 2];
     for core in tiling(args.size, PART) {
