@@ -250,7 +250,10 @@ impl TileWriter {
             (file, Some(temporary))
         };
         let out = if path.extension().is_some_and(|extension| extension == "zst") {
-            Out::Zstd(Box::new(zstd::Encoder::new(file, 3)?))
+            let mut out = zstd::Encoder::new(file, 3)?;
+            // Without, damage to samples would go unseen.
+            out.include_checksum(true)?;
+            Out::Zstd(Box::new(out))
         } else {
             Out::Plain(BufWriter::with_capacity(BUFFER, file))
         };
