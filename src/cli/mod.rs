@@ -2,6 +2,7 @@
 //!
 //! Exit codes: 0 done, 1 failed, 2 bad usage, 3 bad input, 4 the service refused.
 
+mod serve;
 mod synth;
 
 use clap::Parser;
@@ -17,6 +18,7 @@ struct Cli {
 
 #[derive(clap::Subcommand)]
 enum Command {
+    Serve(serve::Args),
     Synth(synth::Args),
 }
 
@@ -51,6 +53,7 @@ impl Failure {
 /// Parses the command line, runs the command, and says how it went.
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
+        Command::Serve(args) => serve::run(args),
         Command::Synth(args) => synth::run(args),
     };
     match result {
