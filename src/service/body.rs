@@ -181,8 +181,8 @@ mod tests {
             let mut encoder = zstd::Encoder::new(Vec::new(), 1).unwrap();
             encoder.window_log(log).unwrap();
             encoder.include_contentsize(false).unwrap();
-            std::io::Write::write_all(&mut encoder, b"small").unwrap();
-            std::io::Write::flush(&mut encoder).unwrap();
+            io::Write::write_all(&mut encoder, b"small").unwrap();
+            io::Write::flush(&mut encoder).unwrap();
             encoder.finish().unwrap()
         };
         assert_eq!(all(Some("zstd"), packed(MAX_WINDOW_LOG)), Ok(b"small".to_vec()));

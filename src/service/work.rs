@@ -79,7 +79,7 @@ mod tests {
         let work = Work::new(2).unwrap();
         runtime.block_on(async {
             for _ in 0..5 {
-                let panicked = work.run(|pool| pool.install(|| panic!("on purpose"))).await as Result<(), _>;
+                let panicked: Result<(), Refusal> = work.run(|pool| pool.install(|| panic!("on purpose"))).await;
                 let problem = panicked.unwrap_err().0;
                 assert_eq!((problem.status, problem.code.as_str()), (500, "internal"));
                 assert!(!problem.detail.contains("purpose"));
