@@ -5,16 +5,20 @@
 //!
 //! With the feature `program` (the default) everything around it:
 //!
+//! - `admission`: the memory budget.
+//! - `config`: what the service is told when it starts.
+//! - `service`: tiles in, results and images out, over HTTP.
 //! - `stitch`: the image being assembled from filtered tiles, and OpenEXR files.
 //! - `picture`: PNG pictures of linear images, alone and side by side.
 //! - `report`: how far an image is from its reference.
 //! - `store`: samples on disk, from which tiles of any size are cut.
 //! - `wire`: tiles and results as MessagePack, without I/O, and files of tiles.
 //! - `client`: HTTP client of the service, with retries.
-//! - `config`: what is set by words, like sizes in bytes.
 //! - `cli`: the `rpfd` command, one file per subcommand.
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "program")]
+pub mod admission;
 #[cfg(feature = "program")]
 pub mod cli;
 #[cfg(feature = "program")]
@@ -26,6 +30,8 @@ pub mod filter;
 pub mod picture;
 #[cfg(feature = "program")]
 pub mod report;
+#[cfg(feature = "program")]
+pub mod service;
 #[cfg(feature = "program")]
 pub mod stitch;
 #[cfg(feature = "program")]

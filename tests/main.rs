@@ -2,4 +2,5 @@
 #![expect(clippy::unwrap_used, reason = "a failed unwrap fails the test, in helpers too")]
 
 mod cli;
+mod service;
 mod stitch;

@@ -53,9 +53,11 @@ impl MethodArgs {
         Method::with(&self.preset, self.settings.iter().map(|(name, value)| (name, value)))
     }
 
-    /// The parameters that were set, as they were given.
-    pub(crate) fn settings(&self) -> &[(String, String)] {
-        &self.settings
+    /// As the service takes it: preset, seed, and the parameters that were set.
+    pub(crate) fn to_json(&self, method: &Method) -> serde_json::Value {
+        let settings = self.settings.iter().map(|(name, value)| (name.clone(), value.clone().into()));
+        let own = [("preset".to_owned(), method.preset_name().into()), ("seed".to_owned(), self.seed.into())];
+        settings.chain(own).collect::<serde_json::Map<_, _>>().into()
     }
 }
 

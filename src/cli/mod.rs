@@ -5,6 +5,7 @@
 //! `--json` as one JSON object on one line.
 
 mod args;
+mod demo;
 mod failure;
 mod filter;
 mod input;
@@ -12,9 +13,11 @@ mod inspect;
 mod post;
 mod progress;
 mod schedule;
+mod serve;
 mod synth;
 
 use clap::Parser;
+use failure::{Failure, FailureKind};
 use std::process::ExitCode;
 
 /// Streaming, tile-based denoising of Monte Carlo renders by Random Parameter Filtering.
@@ -35,18 +38,22 @@ Examples:
 
 #[derive(clap::Subcommand)]
 enum Command {
+    Demo(demo::Args),
     Filter(Box<filter::Args>),
     Inspect(inspect::Args),
     Post(Box<post::Args>),
+    Serve(serve::Args),
     Synth(synth::Args),
 }
 
 /// Parses the command line, runs the command, and says how it went.
 pub fn main() -> ExitCode {
     let (json, result) = match Cli::parse().command {
+        Command::Demo(args) => (args.json, demo::run(&args)),
         Command::Filter(args) => (args.json, filter::run(&args)),
         Command::Inspect(args) => (args.json, inspect::run(&args)),
         Command::Post(args) => (args.json, post::run(&args)),
+        Command::Serve(args) => (false, serve::run(args)),
         Command::Synth(args) => (args.json, synth::run(&args)),
     };
     match result {

@@ -94,12 +94,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     input.fill(&mut spool, &stop)?;
     let tiles: Vec<TileGeometry> = cut_tiles(&input, &method, args.tile).collect();
-    let settings = args.method.settings().iter().cloned().map(|(name, value)| (name, value.into()));
-    let mut body: serde_json::Map<_, _> = settings.collect();
-    body.insert("preset".into(), method.preset_name().into());
-    body.insert("seed".into(), args.method.seed.into());
     let id = args.id.clone().unwrap_or_else(new_id);
-    client.open_image(&id, input.image(), body.into())?;
+    client.open_image(&id, input.image(), args.method.to_json(&method))?;
     let sending = Sending { client: &client, id: &id, connections: args.connections, stop: &stop };
     let fetched = sending.send(&input, &spool, &tiles).and_then(|sent| {
         sending.fetch(sent.stored > 0, &args.exr.query(), &args.output)?;

@@ -2,6 +2,7 @@
 //!
 //! - [`coverage`]: which cores have come and what is missing.
 //! - [`canvas`]: their pixels, in a file.
+//! - [`digest`](mod@digest): whether two tiles bring the same samples.
 //! - [`exr`]: the finished image as OpenEXR; reference images.
 //! - [`atomic`]: files that are complete or not there.
 //!
@@ -24,9 +25,11 @@
 pub mod atomic;
 pub mod canvas;
 pub mod coverage;
+pub mod digest;
 pub mod exr;
 
 pub use canvas::{Canvas, CanvasError, Pixels, RgbImage};
+pub use digest::digest;
 pub use exr::{ExrCompression, ExrError, ExrLayout, ExrOptions, ExrSamples, ExrSummary};
 
 use crate::filter::{
