@@ -39,6 +39,9 @@ pub(crate) struct Args {
     /// Seconds that a request's body may bring nothing [default: 30]
     #[arg(long, value_name = "SECONDS")]
     idle_deadline: Option<f64>,
+    /// Seconds that the head of a request may take [default: 15]
+    #[arg(long, value_name = "SECONDS")]
+    header_deadline: Option<f64>,
 }
 
 impl Args {
@@ -56,6 +59,7 @@ impl Args {
             data_dir: self.data_dir.unwrap_or(default.data_dir),
             queue_deadline: seconds(self.queue_deadline, default.queue_deadline)?,
             idle_deadline: seconds(self.idle_deadline, default.idle_deadline)?,
+            header_deadline: seconds(self.header_deadline, default.header_deadline)?,
             ..Config::default()
         })
     }

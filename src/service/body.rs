@@ -1,18 +1,24 @@
 //! The body of a request: frames as they come, decompressed if they are compressed.
 
-use std::{io, pin::Pin, time::Duration};
+use std::{
+    io,
+    pin::Pin,
+    task::{Context, Poll},
+    time::Duration,
+};
 
 use async_compression::{
     tokio::bufread::{GzipDecoder, ZstdDecoder},
     zstd::DParameter,
 };
 use axum::{
-    body::Body,
+    body::{Body, BodyDataStream},
+    extract::Request,
     http::{HeaderMap, StatusCode, header},
 };
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt, TryStreamExt};
-use tokio::time::timeout;
+use tokio::{runtime::Handle, time::timeout};
 use tokio_util::io::{ReaderStream, StreamReader};
 
 use super::problem::Refusal;
@@ -21,7 +27,7 @@ use crate::wire::file::MAX_WINDOW_LOG;
 /// Bytes decompressed at a time.
 const BUFFER: usize = 64 << 10;
 /// How long the rest of a body is read, and thrown away, whose request was answered already.
-const DRAIN: Duration = Duration::from_secs(10);
+const LINGER: Duration = Duration::from_secs(10);
 
 type Source = Pin<Box<dyn Stream<Item = io::Result<Bytes>> + Send>>;
 
@@ -30,7 +36,6 @@ type Source = Pin<Box<dyn Stream<Item = io::Result<Bytes>> + Send>>;
 pub(super) struct Frames {
     source: Source,
     idle: Duration,
-    begun: bool,
     ended: bool,
 }
 
@@ -71,12 +76,11 @@ impl Frames {
                 ));
             }
         };
-        Ok(Self { source, idle, begun: false, ended: false })
+        Ok(Self { source, idle, ended: false })
     }
 
     /// The next bytes, never none; `Ok(None)` at the end of the body.
     pub(super) async fn next(&mut self) -> Result<Option<Bytes>, Refusal> {
-        self.begun = true;
         while !self.ended {
             let Ok(frame) = timeout(self.idle, self.source.next()).await else {
                 self.ended = true;
@@ -105,7 +109,6 @@ impl Frames {
         let mut all = Vec::new();
         while let Some(frame) = self.next().await? {
             if all.len() + frame.len() > limit {
-                self.drain();
                 return Err(Refusal::new(
                     StatusCode::PAYLOAD_TOO_LARGE,
                     "body_too_large",
@@ -117,13 +120,39 @@ impl Frames {
         }
         Ok(all)
     }
+}
 
-    /// Reads the rest and throws it away, for a while: a client that still sends would otherwise see its connection
-    /// reset, and not the answer. Of a body that was never asked for nothing is read.
-    pub(super) fn drain(self) {
-        let Self { mut source, begun, ended, .. } = self;
-        if begun && !ended {
-            tokio::spawn(timeout(DRAIN, async move { while let Some(Ok(_)) = source.next().await {} }));
+/// A body whose rest is read and thrown away, for a while, when it is dropped: a client that still sends would otherwise
+/// see its connection reset, and not the answer. Not so if the client waits for the word to go on, and never got it.
+struct Lingering {
+    inner: Option<BodyDataStream>,
+    waits: bool,
+}
+
+/// Makes a request's body one that [lingers](Lingering).
+pub(super) async fn linger(request: Request) -> Request {
+    let waits = request.headers().contains_key(header::EXPECT);
+    request.map(|body| Body::from_stream(Lingering { inner: Some(body.into_data_stream()), waits }))
+}
+
+impl Stream for Lingering {
+    type Item = Result<Bytes, axum::Error>;
+
+    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        self.waits = false;
+        let Some(inner) = &mut self.inner else { return Poll::Ready(None) };
+        let polled = inner.poll_next_unpin(context);
+        if !matches!(polled, Poll::Pending | Poll::Ready(Some(Ok(_)))) {
+            self.inner = None;
+        }
+        polled
+    }
+}
+
+impl Drop for Lingering {
+    fn drop(&mut self) {
+        if let (Some(mut inner), false, Ok(runtime)) = (self.inner.take(), self.waits, Handle::try_current()) {
+            runtime.spawn(timeout(LINGER, async move { while let Some(Ok(_)) = inner.next().await {} }));
         }
     }
 }

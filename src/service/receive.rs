@@ -155,11 +155,6 @@ impl Receiver {
             }
         }
     }
-
-    /// Reads on for a while, so that a client that still sends gets its answer; memory that was reserved is free now.
-    pub(super) fn drain(self) {
-        self.frames.drain();
-    }
 }
 
 enum Step {

@@ -6,12 +6,12 @@ use axum::{
     Router,
     extract::{Request, State},
     http::{Method, StatusCode, Uri},
-    middleware::{Next, from_fn},
+    middleware::{Next, from_fn, map_request},
     response::Response,
     routing::{get, post},
 };
 
-use super::{Shared, images, problem::Refusal, stream};
+use super::{Shared, body, images, problem::Refusal, stream};
 
 pub(super) fn router(service: Shared) -> Router {
     Router::new()
@@ -25,6 +25,7 @@ pub(super) fn router(service: Shared) -> Router {
         .route("/readyz", get(ready))
         .fallback(nothing)
         .method_not_allowed_fallback(not_allowed)
+        .layer(map_request(body::linger))
         .layer(from_fn(log))
         .with_state(service)
 }

@@ -219,13 +219,7 @@ async fn first(call: &Call, receiver: &mut Receiver) -> Result<Received, Refusal
 /// Answers with a result stream.
 async fn answer(call: Call, request: Request, media: &'static str) -> Result<Response, Refusal> {
     let mut receiver = receiver(&call, request)?;
-    let received = match first(&call, &mut receiver).await {
-        Ok(received) => received,
-        Err(refusal) => {
-            receiver.drain();
-            return Err(refusal);
-        }
-    };
+    let received = first(&call, &mut receiver).await?;
     let folder = call.service.config.data_dir.clone();
     let (results, reader) = blocking(move || Results::new(&folder)).await??;
     let stop = Stop::default();
@@ -295,7 +289,6 @@ async fn session(
     while let Some(fine) = jobs.join_next().await {
         count(Some(fine));
     }
-    receiver.drain();
     tracing::info!(tiles, errors, seconds = started.elapsed().as_secs_f64(), "tile stream done");
     call.end(results, tiles, errors).await;
 }
@@ -317,12 +310,8 @@ async fn job(call: Arc<Call>, received: Received, results: Arc<Results>, stop: A
 /// Answers with a picture of a single tile.
 async fn single(call: Call, request: Request, form: Form) -> Result<Response, Refusal> {
     let mut receiver = receiver(&call, request)?;
-    let read = match first(&call, &mut receiver).await {
-        Ok(received) => receiver.end(&call).await.map(|()| received),
-        Err(refusal) => Err(refusal),
-    };
-    receiver.drain();
-    let received = read?;
+    let received = first(&call, &mut receiver).await?;
+    receiver.end(&call).await?;
     let stop = Stop::default();
     let flag = stop.flag();
     let call = Arc::new(call);
@@ -342,7 +331,9 @@ fn picture(
     let geometry = *assembler.header().geometry();
     let held = Held { permit, output: plan.output };
     let filtered = call.filter(assembler.finish()?, held, pool, stop);
-    let Some((done, _held)) = filtered else { return Err(internal("stopped without a client").into()) };
+    let Some((done, _held)) = filtered else {
+        return Err(Problem::new(503, "stopped", "The work was stopped", "the client has gone").into());
+    };
     let mut options = ExrOptions { attributes: attributes(&call.method, call.seed), ..ExrOptions::default() };
     if geometry.core() != geometry.image() {
         options.attributes.insert("rpfd:tile".into(), geometry.core().to_string());

@@ -43,7 +43,7 @@ fn streams_that_cannot_be_read_have_a_code_and_a_status() {
             "over_memory",
             413,
             changed(|h| {
-                (h["image"], h["tile"], h["samples"]) = (json!([9000, 9000]), json!([0, 0, 9000, 9000]), json!(16));
+                (h["image"], h["tile"], h["samples"]) = (json!([9000, 9000]), json!([0, 0, 9000, 9000]), json!(4));
             }),
         ),
         ("plane_size", 400, {
@@ -99,9 +99,8 @@ fn after_the_first_tile_failures_are_messages() {
     server.call("POST", "/v1/filter", &accept, &[&good[..], cut].concat()).problem(400, "one_tile_only");
     server.call("POST", "/v1/filter", &accept, &[&good[..], b"x"].concat()).problem(400, "trailing");
     // A tile that is refused does not end the stream: the one after it is filtered.
-    let huge = changed(|h| {
-        (h["image"], h["tile"], h["samples"]) = (json!([9000, 9000]), json!([0, 0, 9000, 9000]), json!(16))
-    });
+    let huge =
+        changed(|h| (h["image"], h["tile"], h["samples"]) = (json!([9000, 9000]), json!([0, 0, 9000, 9000]), json!(4)));
     let messages = server.post("/v1/filter", &[&good[..], &huge, &good].concat()).messages();
     let codes: Vec<_> = messages
         .iter()

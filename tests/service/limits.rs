@@ -2,7 +2,9 @@
 
 use super::{Answer, Server, encode, head, samples, tile, whole};
 use rpfd::{
+    config::Config,
     filter::{Channel, ChannelSet, Method, Rect, Role, TileGeometry, plan::plan},
+    service::Service,
     wire::{Format, Header, Message, SampleCounts, encode_header},
 };
 use std::{
@@ -64,7 +66,6 @@ fn a_full_budget_is_503_until_it_is_free_again() {
 fn a_client_that_disappears_stops_its_work_and_frees_its_memory() {
     let server = Server::start(&["--memory", &memory(48, "paper"), "--queue-deadline", "5"]);
     let body = tile(IMAGE, Rect::new(0, 0, 48, 48), 0);
-    let path = "/v1/filter?preset=paper&fractions=4,4,4,4&max_neighbors=65536";
     for accept in ["Accept: application/msgpack", "Accept: image/x-exr"] {
         let mut gone = server.connect();
         gone.write_all(head("POST", "/v1/filter?preset=paper", &[accept], body.len()).as_bytes()).unwrap();
@@ -73,7 +74,7 @@ fn a_client_that_disappears_stops_its_work_and_frees_its_memory() {
         drop(gone);
         let started = Instant::now();
         let answer = server.post("/v1/filter?preset=unfiltered", &body);
-        assert_eq!(answer.status, 200, "{path}: {}", String::from_utf8_lossy(&answer.body));
+        assert_eq!(answer.status, 200, "{}", String::from_utf8_lossy(&answer.body));
         assert!(started.elapsed() < Duration::from_secs(4));
     }
 }
@@ -106,6 +107,24 @@ fn nobody_has_to_read_while_sending() {
 }
 
 #[test]
+fn a_client_that_only_sends_gets_its_refusal() {
+    let server = Server::start(&["--memory", "1MiB"]);
+    let body = whole(320);
+    let zstd = ["Content-Encoding: zstd"];
+    for (path, headers, status, code) in [
+        ("/v1/filter?preset=x", &[][..], 400, "unknown_preset"),
+        ("/v1/images/x/tiles", &[], 404, "unknown_image"),
+        ("/v1/filter", &[], 413, "over_memory"),
+        ("/v1/filter", &zstd, 400, "compression"),
+    ] {
+        let mut stream = server.connect();
+        stream.write_all(head("POST", path, headers, body.len()).as_bytes()).unwrap();
+        stream.write_all(&body).expect("the service takes what it has refused");
+        Answer::read(&mut stream).problem(status, code);
+    }
+}
+
+#[test]
 fn an_idle_body_is_given_up() {
     let server = Server::start(&["--idle-deadline", "0.2"]);
     let body = whole(16);
@@ -117,7 +136,8 @@ fn an_idle_body_is_given_up() {
 
 #[test]
 fn it_stops_when_told_to_after_what_has_begun() {
-    let server = Server::start(&[]);
+    // Half a head is not waited for longer than that.
+    let server = Server::start(&["--header-deadline", "1"]);
     let mut idle = server.connect();
     idle.write_all(b"GET /livez HTTP/1.1\r\n").unwrap();
     let body = whole(32);
@@ -149,4 +169,29 @@ fn a_wrong_configuration_is_refused_all_at_once() {
     let (code, message) = serve(&["--listen", "127.0.0.1:0", "--data-dir", "/dev/null/x"]);
     assert_eq!(code, Some(1));
     assert!(message.contains("/dev/null/x") && message.contains("data_dir"), "{message}");
+}
+
+#[test]
+fn it_runs_in_process_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = Config {
+        listen: "127.0.0.1:0".parse().unwrap(),
+        data_dir: folder.path().join("made/for/it"),
+        threads: 1,
+        ..Config::default()
+    };
+    let service = Service::bind(config).unwrap();
+    let address = service.local_addr();
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    let thread = std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(service.run(async { drop(stopped.await) }))
+    });
+    let mut stream = std::net::TcpStream::connect(address).unwrap();
+    let body = whole(16);
+    stream.write_all(head("POST", "/v1/filter", &[], body.len()).as_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    assert_eq!(Answer::read(&mut stream).messages().len(), 2);
+    stop.send(()).unwrap();
+    thread.join().unwrap().unwrap();
 }
