@@ -5,21 +5,33 @@
 //!
 //! With the feature `program` (the default) everything around it:
 //!
+//! - `admission`: the memory budget.
+//! - `config`: what the service is told when it starts.
+//! - `service`: tiles in, results and images out, over HTTP.
 //! - `stitch`: the image being assembled from filtered tiles, and OpenEXR files.
 //! - `picture`: PNG pictures of linear images, alone and side by side.
 //! - `report`: how far an image is from its reference.
 //! - `store`: samples on disk, from which tiles of any size are cut.
 //! - `wire`: tiles and results as MessagePack, without I/O, and files of tiles.
+//! - `client`: HTTP client of the service, with retries.
 //! - `cli`: the `rpfd` command, one file per subcommand.
 #![forbid(unsafe_code)]
 
 #[cfg(feature = "program")]
+pub mod admission;
+#[cfg(feature = "program")]
 pub mod cli;
+#[cfg(feature = "program")]
+pub mod client;
+#[cfg(feature = "program")]
+pub mod config;
 pub mod filter;
 #[cfg(feature = "program")]
 pub mod picture;
 #[cfg(feature = "program")]
 pub mod report;
+#[cfg(feature = "program")]
+pub mod service;
 #[cfg(feature = "program")]
 pub mod stitch;
 #[cfg(feature = "program")]

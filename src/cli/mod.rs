@@ -1,63 +1,63 @@
 //! The `rpfd` command, one file per subcommand.
 //!
-//! Exit codes: 0 done, 1 failed, 2 bad usage, 3 bad input, 4 the service refused.
+//! Exit codes: 0 done, 1 failed, 2 bad usage, 3 bad input, 4 the service refused. What a command has to say goes to
+//! standard output, with `--json` as one JSON object; progress, warnings and errors go to standard error, the error with
+//! `--json` as one JSON object on one line.
 
+mod args;
+mod demo;
+mod failure;
+mod filter;
+mod input;
+mod inspect;
+mod post;
+mod progress;
+mod schedule;
+mod serve;
 mod synth;
 
 use clap::Parser;
+use failure::{Failure, FailureKind};
 use std::process::ExitCode;
 
 /// Streaming, tile-based denoising of Monte Carlo renders by Random Parameter Filtering.
 #[derive(Parser)]
-#[command(version, propagate_version = true)]
+#[command(version, propagate_version = true, after_help = EXIT_CODES)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
 }
 
+const EXIT_CODES: &str = "\
+Exit codes: 0 done, 1 failed, 2 bad usage, 3 bad input, 4 the service refused.
+
+Examples:
+  rpfd demo                                       see it work, on a real render
+  rpfd inspect render.tiles.zst                   what is in a file, and what is wrong with it
+  rpfd filter render.tiles.zst -o render.exr      denoise a file";
+
 #[derive(clap::Subcommand)]
 enum Command {
+    Demo(demo::Args),
+    Filter(Box<filter::Args>),
+    Inspect(inspect::Args),
+    Post(Box<post::Args>),
+    Serve(serve::Args),
     Synth(synth::Args),
-}
-
-/// Why a command did not do what it was asked to.
-#[derive(Debug)]
-pub(crate) struct Failure {
-    kind: FailureKind,
-    /// Stable word for scripts, like `truncated`.
-    code: &'static str,
-    message: String,
-}
-
-/// What a failure exits with.
-#[derive(Clone, Copy, Debug)]
-pub(crate) enum FailureKind {
-    /// Something went wrong here.
-    Failed = 1,
-    /// The command line does not make sense.
-    Usage = 2,
-    /// The input is not what it should be.
-    Input = 3,
-    /// The service said no.
-    Refused = 4,
-}
-
-impl Failure {
-    pub(crate) fn new(kind: FailureKind, code: &'static str, message: impl std::fmt::Display) -> Self {
-        Self { kind, code, message: message.to_string() }
-    }
 }
 
 /// Parses the command line, runs the command, and says how it went.
 pub fn main() -> ExitCode {
-    let result = match Cli::parse().command {
-        Command::Synth(args) => synth::run(args),
+    let (json, result) = match Cli::parse().command {
+        Command::Demo(args) => (args.json, demo::run(&args)),
+        Command::Filter(args) => (args.json, filter::run(&args)),
+        Command::Inspect(args) => (args.json, inspect::run(&args)),
+        Command::Post(args) => (args.json, post::run(&args)),
+        Command::Serve(args) => (false, serve::run(args)),
+        Command::Synth(args) => (args.json, synth::run(&args)),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(Failure { kind, code, message }) => {
-            eprintln!("rpfd: {message} ({code})");
-            ExitCode::from(kind as u8)
-        }
+        Err(failure) => failure.report(json),
     }
 }

@@ -35,8 +35,8 @@ impl<T> Coverage<T> {
         self.cores.get_mut(&(core.y, core.x)).filter(|(known, _)| known == core).map(|(_, value)| value)
     }
 
-    /// Known cores that have a pixel in common with a window, by rows (y, then x).
-    pub fn meeting(&self, window: &Rect) -> Vec<Rect> {
+    /// Known cores that have a pixel in common with a window, with their values, by rows (y, then x).
+    pub fn meeting(&self, window: &Rect) -> Vec<(Rect, &T)> {
         let mut found: Vec<Rect> = Vec::new();
         for ((row_bits, column_bits), grid) in &self.grids {
             // A core is at most as large as a cell, so it reaches no further than into the next one.
@@ -52,13 +52,13 @@ impl<T> Coverage<T> {
             }
         }
         found.sort_unstable_by_key(|core| (core.y, core.x));
-        found
+        found.into_iter().filter_map(|core| Some((core, self.get(&core)?))).collect()
     }
 
     /// Adds a core with pixels. If it has some in common with a known one, which it may equal, nothing is added and that
     /// one returned.
     pub fn insert(&mut self, core: Rect, value: T) -> Result<(), Rect> {
-        if let Some(other) = self.meeting(&core).first() {
+        if let Some((other, _)) = self.meeting(&core).first() {
             return Err(*other);
         }
         let (class, cell) = place(&core);
@@ -89,8 +89,8 @@ impl<T> Coverage<T> {
 
     /// As [`Self::missing`], counting only cores whose value passes.
     pub fn missing_but(&self, window: &Rect, counts: impl Fn(&T) -> bool) -> Vec<Rect> {
-        let counted = self.meeting(window).into_iter().filter(|core| self.get(core).is_some_and(&counts));
-        let mut parts: Vec<Rect> = counted.filter_map(|core| core.intersection(window)).collect();
+        let counted = self.meeting(window).into_iter().filter(|(_, value)| counts(value));
+        let mut parts: Vec<Rect> = counted.filter_map(|(core, _)| core.intersection(window)).collect();
         parts.sort_unstable_by_key(|part| (part.y, part.x));
         gaps(*window, parts)
     }
@@ -259,7 +259,8 @@ mod tests {
         coverage.insert(Rect::new(20, 0, 500, 10), 2).unwrap();
         assert_eq!(coverage.insert(Rect::new(10, 0, 10, 10), 3), Err(Rect::new(10, 0, 10, 10)));
         assert_eq!(coverage.meeting(&Rect::new(0, 0, 10, 10)), []);
-        assert_eq!(coverage.meeting(&Rect::new(10, 0, 11, 10)), [Rect::new(10, 0, 10, 10), Rect::new(20, 0, 500, 10)]);
+        let found = coverage.meeting(&Rect::new(10, 0, 11, 10));
+        assert_eq!(found, [(Rect::new(10, 0, 10, 10), &1), (Rect::new(20, 0, 500, 10), &2)]);
         assert_eq!(coverage.get(&Rect::new(10, 0, 10, 9)), None);
         let window = Rect::new(0, 0, 520, 10);
         assert_eq!(coverage.missing(&window), [Rect::new(0, 0, 10, 10)]);

@@ -1,6 +1,7 @@
 //! The image being assembled: filtered cores in, in any order; an EXR out.
 //!
 //! - [`canvas`]: their pixels, in a file.
+//! - [`digest`](mod@digest): whether two tiles bring the same samples.
 //! - [`exr`]: the finished image as OpenEXR; reference images.
 //! - [`atomic`]: files that are complete or not there.
 //!
@@ -22,9 +23,11 @@
 
 pub mod atomic;
 pub mod canvas;
+pub mod digest;
 pub mod exr;
 
 pub use canvas::{Canvas, CanvasError, Pixels, RgbImage};
+pub use digest::digest;
 pub use exr::{ExrCompression, ExrError, ExrLayout, ExrOptions, ExrSamples, ExrSummary};
 
 use crate::filter::{
@@ -311,7 +314,8 @@ impl Stitcher {
     fn check(&mut self, core: Rect) -> Result<(), StitchError> {
         let Rect { width, height, .. } = self.image();
         TileGeometry::new([width, height], core, Halo::default())?;
-        for other in self.coverage.meeting(&core).into_iter().filter(|other| *other != core) {
+        let meeting: Vec<Rect> = self.coverage.meeting(&core).into_iter().map(|(other, _)| other).collect();
+        for other in meeting.into_iter().filter(|other| *other != core) {
             let entry = self.coverage.get_mut(&other);
             if entry.is_some_and(|entry| {
                 entry.forget_dead();

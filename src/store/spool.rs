@@ -259,7 +259,7 @@ impl Spool {
                 return disagreement("the channels");
             }
         }
-        if let Some(&other) = self.tiles.meeting(&tile).first() {
+        if let Some(&(other, _)) = self.tiles.meeting(&tile).first() {
             return Err(SpoolError::Overlap { tile, other });
         }
         let before = self.backing.len();
@@ -312,16 +312,20 @@ impl Spool {
     /// A tile of this geometry, which must be of the same image. Memory: the tile, 4 bytes a pixel, and a row of samples.
     pub fn cut(&self, geometry: TileGeometry) -> Result<SampleTile, SpoolError> {
         let window = geometry.window();
-        let (tile, missing) = (geometry.core(), self.missing(&window));
-        let Some((image, channels)) = &self.first else { return Err(SpoolError::Missing { window, missing }) };
+        let missing = self.missing(&window);
+        if missing.is_empty() { self.cut_partial(geometry) } else { Err(SpoolError::Missing { window, missing }) }
+    }
+
+    /// As [`cut`](Self::cut), but pixels that no tile has brought are pixels without samples.
+    pub fn cut_partial(&self, geometry: TileGeometry) -> Result<SampleTile, SpoolError> {
+        let (window, tile) = (geometry.window(), geometry.core());
+        let Some((image, channels)) = &self.first else {
+            return Err(SpoolError::Missing { window, missing: vec![window] });
+        };
         if geometry.image() != *image {
             return Err(SpoolError::Disagreement { tile, what: "the size of the image" });
         }
-        if !missing.is_empty() {
-            return Err(SpoolError::Missing { window, missing });
-        }
-        let meeting = self.tiles.meeting(&window);
-        let parts: Vec<_> = meeting.into_iter().filter_map(|core| Some((core, self.tiles.get(&core)?))).collect();
+        let parts = self.tiles.meeting(&window);
         let layout = self.layout(&window, &parts)?;
         let planes = (0..channels.planes()).map(|plane| self.plane(&window, &parts, &layout, plane));
         let planes = planes.collect::<Result<Vec<_>, _>>()?;
@@ -336,7 +340,7 @@ impl Spool {
         });
         let first = uniform.next().flatten();
         let counts = match first {
-            Some(n) if uniform.all(|other| other == first) => Counts::Uniform(n),
+            Some(n) if uniform.all(|other| other == first) && covered(window, parts) => Counts::Uniform(n),
             _ => {
                 let mut counts = vec![0; window.area() as usize];
                 let mut bytes = Vec::new();
@@ -493,6 +497,12 @@ impl Layout {
     fn into_counts(self) -> Counts {
         self.counts
     }
+}
+
+/// Whether these cores, which do not overlap, cover all of a window.
+fn covered(window: &Rect, parts: &[(Rect, &Stored)]) -> bool {
+    let areas = parts.iter().filter_map(|(core, _)| core.intersection(window));
+    areas.map(|part| part.area()).sum::<u64>() == window.area()
 }
 
 fn sum(counts: &[u16]) -> usize {

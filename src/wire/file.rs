@@ -15,6 +15,30 @@ pub const MAX_WINDOW_LOG: u32 = 27;
 /// What a zstd frame starts with.
 const ZSTD_MAGIC: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
 
+/// Most bytes that the head of a zstd frame has.
+const ZSTD_HEADER: usize = 18;
+
+/// The window of a zstd frame with this head (RFC 8878, 3.1.1.1), at most what is allowed; never 0.
+fn window_bytes(head: &[u8]) -> u64 {
+    let at = |index: usize| u64::from(head.get(index).copied().unwrap_or(0));
+    let descriptor = at(4);
+    let window = if descriptor & 0x20 == 0 {
+        let base = 1 << (10 + (at(5) >> 3));
+        base + base / 8 * (at(5) & 7)
+    } else {
+        // A single segment: the window is the content, whose size comes after the dictionary's number.
+        let from = 5 + [0, 1, 2, 4][(descriptor & 3) as usize];
+        let field = |bytes: usize| (0..bytes).rev().fold(0, |sum, k| sum << 8 | at(from + k));
+        match descriptor >> 6 {
+            0 => field(1),
+            1 => field(2) + 256,
+            2 => field(4),
+            _ => field(8),
+        }
+    };
+    window.clamp(1, 1 << MAX_WINDOW_LOG)
+}
+
 /// Bytes read at a time.
 const BUFFER: usize = 256 << 10;
 
@@ -68,7 +92,8 @@ impl FileError {
 pub struct TileFile {
     path: PathBuf,
     source: Box<dyn Read + Send>,
-    compressed: bool,
+    /// Bytes of the decompressor's window; 0 where nothing is compressed.
+    window: u64,
     buffer: Vec<u8>,
     start: usize,
     end: usize,
@@ -89,23 +114,23 @@ impl TileFile {
     pub fn from_reader(path: impl Into<PathBuf>, mut source: impl Read + Send + 'static) -> Result<Self, FileError> {
         let path = path.into();
         let opened = (|| {
-            let mut magic = Vec::with_capacity(4);
-            source.by_ref().take(4).read_to_end(&mut magic)?;
-            let compressed = magic == ZSTD_MAGIC;
-            let source: Chain<_, _> = Cursor::new(magic).chain(source);
-            let source: Box<dyn Read + Send> = if compressed {
+            let mut head = Vec::with_capacity(ZSTD_HEADER);
+            source.by_ref().take(ZSTD_HEADER as u64).read_to_end(&mut head)?;
+            let window = if head.starts_with(&ZSTD_MAGIC) { window_bytes(&head) } else { 0 };
+            let source: Chain<_, _> = Cursor::new(head).chain(source);
+            let source: Box<dyn Read + Send> = if window > 0 {
                 let mut source = zstd::Decoder::new(source)?;
                 source.window_log_max(MAX_WINDOW_LOG)?;
                 Box::new(source)
             } else {
                 Box::new(source)
             };
-            Ok((source, compressed))
+            Ok((source, window))
         })();
         match opened {
-            Ok((source, compressed)) => {
+            Ok((source, window)) => {
                 let (buffer, decoder) = (vec![0; BUFFER], Decoder::new());
-                Ok(Self { path, source, compressed, buffer, start: 0, end: 0, decoder })
+                Ok(Self { path, source, window, buffer, start: 0, end: 0, decoder })
             }
             Err(error) => Err(FileError::io(path, error)),
         }
@@ -113,7 +138,12 @@ impl TileFile {
 
     /// Whether the file is compressed.
     pub const fn compressed(&self) -> bool {
-        self.compressed
+        self.window > 0
+    }
+
+    /// Bytes that the decompressor keeps of what it has read, by the head of the file; 0 where nothing is compressed.
+    pub const fn window_bytes(&self) -> u64 {
+        self.window
     }
 
     /// The next event; `Ok(None)` at the end of a whole stream.
@@ -133,7 +163,7 @@ impl TileFile {
                 Ok(len) => (self.start, self.end) = (0, len),
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
                 // What the decompressor says has no number of the system's.
-                Err(error) if self.compressed && error.raw_os_error().is_none() => {
+                Err(error) if self.compressed() && error.raw_os_error().is_none() => {
                     return Err(self.fail(FileFault::Compression(error)));
                 }
                 Err(error) => return Err(self.fail(FileFault::Io(error))),
@@ -224,7 +254,10 @@ impl TileWriter {
             (file, Some(temporary))
         };
         let out = if path.extension().is_some_and(|extension| extension == "zst") {
-            Out::Zstd(Box::new(zstd::Encoder::new(file, 3)?))
+            let mut out = zstd::Encoder::new(file, 3)?;
+            // Without, damage to samples would go unseen.
+            out.include_checksum(true)?;
+            Out::Zstd(Box::new(out))
         } else {
             Out::Plain(BufWriter::with_capacity(BUFFER, file))
         };

@@ -36,6 +36,8 @@ pub struct Summary {
     pub spool_bytes: u64,
     /// Whether the file is compressed.
     pub compressed: bool,
+    /// Bytes that the decompressor keeps while the file is read; 0 where it is not compressed.
+    pub window_bytes: u64,
 }
 
 impl Summary {
@@ -71,6 +73,10 @@ pub struct PlaneSummary {
     pub min: f32,
     /// Greatest finite value.
     pub max: f32,
+    /// Sum of the finite values.
+    pub sum: f64,
+    /// How many values are finite.
+    pub finite: u64,
     /// Values that are NaN; in a feature a sample without it.
     pub nan: u64,
     /// Values that are infinite.
@@ -80,10 +86,17 @@ pub struct PlaneSummary {
 }
 
 impl PlaneSummary {
+    /// Mean of the finite values, if there are any.
+    pub fn mean(&self) -> Option<f64> {
+        (self.finite > 0).then(|| self.sum / self.finite as f64)
+    }
+
     fn add(&mut self, value: f32, times: u64) {
         if value.is_finite() {
             self.min = self.min.min(value);
             self.max = self.max.max(value);
+            self.sum += f64::from(value) * times as f64;
+            self.finite += times;
         } else if value.is_nan() {
             self.nan += times;
         } else {
@@ -99,7 +112,7 @@ pub fn scan(path: impl Into<PathBuf>) -> Result<Summary, FileError> {
 
 /// The same of a file that is open and at its start.
 pub fn scan_file(file: &mut TileFile) -> Result<Summary, FileError> {
-    let compressed = file.compressed();
+    let (compressed, window_bytes) = (file.compressed(), file.window_bytes());
     let mut cores = Coverage::default();
     let mut summary: Option<Summary> = None;
     let mut values = ValueReader::new(Format::F32);
@@ -160,7 +173,8 @@ pub fn scan_file(file: &mut TileFile) -> Result<Summary, FileError> {
         };
         pixel = 0;
         formats = (0..header.channels().planes()).map(|plane| header.plane_format(plane)).collect();
-        let summary = summary.get_or_insert_with(|| Summary::new(header.clone(), compressed));
+        let summary =
+            summary.get_or_insert_with(|| Summary { window_bytes, ..Summary::new(header.clone(), compressed) });
         summary.varying |= uniform && !summary.first.varying() && per_pixel != summary.first.max_per_pixel();
         summary.halos |= geometry.core() != geometry.window();
         if header.varying() {
@@ -192,6 +206,8 @@ impl Summary {
             format: first.plane_format(plane),
             min: f32::INFINITY,
             max: f32::NEG_INFINITY,
+            sum: 0.0,
+            finite: 0,
             nan: 0,
             infinite: 0,
             constant_tiles: 0,
@@ -209,6 +225,7 @@ impl Summary {
             disagreement: None,
             spool_bytes: 0,
             compressed,
+            window_bytes: 0,
         }
     }
 }

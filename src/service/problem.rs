@@ -1,0 +1,175 @@
+//! What went wrong, as an answer: RFC 9457 problems with stable codes.
+
+use axum::{
+    http::{HeaderValue, StatusCode, header},
+    response::{IntoResponse, Response},
+};
+
+use crate::{
+    admission::AdmissionError,
+    filter::{ParameterError, Rect, samples::SampleError},
+    picture::PictureError,
+    stitch::{ExrError, StitchError},
+    wire::{Problem, WireError},
+};
+
+/// An answer that is not what was asked for.
+#[derive(Debug)]
+pub(super) struct Refusal(pub(super) Box<Problem>);
+
+impl<P: Into<Problem>> From<P> for Refusal {
+    fn from(problem: P) -> Self {
+        Self(Box::new(problem.into()))
+    }
+}
+
+impl Refusal {
+    pub(super) fn new(status: StatusCode, code: &str, title: &str, detail: impl Into<String>) -> Self {
+        Problem::new(status.as_u16(), code, title, detail).into()
+    }
+}
+
+impl IntoResponse for Refusal {
+    fn into_response(self) -> Response {
+        let status = StatusCode::from_u16(self.0.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+        // A problem is strings and numbers, which always can be written.
+        let body = serde_json::to_vec(&self.0).unwrap_or_default();
+        let kind = HeaderValue::from_static("application/problem+json");
+        let mut response = (status, [(header::CONTENT_TYPE, kind)], body).into_response();
+        if let Some(seconds) = self.0.more.get("retry_after").and_then(serde_json::Value::as_u64) {
+            response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
+        }
+        response
+    }
+}
+
+/// A rectangle as JSON has it: `[x, y, width, height]`.
+pub(super) fn corners(rect: Rect) -> [u32; 4] {
+    [rect.x, rect.y, rect.width, rect.height]
+}
+
+/// An error of ours; the detail stays in the log.
+pub(super) fn internal(detail: impl std::fmt::Display) -> Problem {
+    tracing::error!(%detail, "internal error");
+    Problem::new(500, "internal", "The service failed", "an internal error; the service's log says more")
+}
+
+/// The disk or the file system refused.
+pub(super) fn storage(code: &str, detail: impl std::fmt::Display) -> Problem {
+    tracing::error!(%detail, code, "storage error");
+    match code {
+        "disk-full" => Problem::new(507, "disk_full", "The service's disk is full", "the data folder takes no more"),
+        _ => Problem::new(500, "storage", "The service's disk failed", "an I/O error; the service's log says more"),
+    }
+}
+
+impl From<std::io::Error> for Refusal {
+    fn from(error: std::io::Error) -> Self {
+        let full = crate::stitch::canvas::is_full(&error);
+        storage(if full { "disk-full" } else { "io" }, error).into()
+    }
+}
+
+impl From<WireError> for Problem {
+    fn from(error: WireError) -> Self {
+        Self::from(&error)
+    }
+}
+
+impl From<SampleError> for Problem {
+    fn from(error: SampleError) -> Self {
+        Self::new(400, "bad_counts", "The samples do not fit their shape", error.to_string())
+    }
+}
+
+impl From<ParameterError> for Problem {
+    fn from(error: ParameterError) -> Self {
+        let code = match error {
+            ParameterError::Preset(_) => "unknown_preset",
+            ParameterError::Name { .. } => "unknown_parameter",
+            ParameterError::Value { .. } => "bad_parameter",
+        };
+        Self::new(400, code, "How to filter is not understood", error.to_string())
+    }
+}
+
+impl From<AdmissionError> for Problem {
+    fn from(error: AdmissionError) -> Self {
+        let detail = error.to_string();
+        match error {
+            AdmissionError::TooLarge { needed, total } => {
+                Self::new(413, error.code(), "The tile needs more memory than the service has", detail)
+                    .with("needed", needed)
+                    .with("available", total)
+            }
+            // Who waited in vain for so long may as well wait that long again.
+            AdmissionError::Busy { needed, deadline } => {
+                Self::new(503, error.code(), "The service's memory is in use", detail)
+                    .with("needed", needed)
+                    .with("retry_after", deadline.as_secs().clamp(1, 60))
+            }
+        }
+    }
+}
+
+impl From<StitchError> for Problem {
+    fn from(error: StitchError) -> Self {
+        let detail = error.to_string();
+        let code = error.code().replace('-', "_");
+        match &error {
+            StitchError::Geometry(_) => Self::new(400, "bad_geometry", "The geometry is impossible", detail),
+            StitchError::Overlap { other, .. } => {
+                Self::new(409, &code, "The tile overlaps another", detail).with("other", corners(*other).to_vec())
+            }
+            StitchError::Conflict(_) => Self::new(409, &code, "The tile is there with other samples", detail),
+            StitchError::Busy(_) => Self::new(409, &code, "The tile is being made from other samples", detail),
+            StitchError::Superseded(_) => Self::new(409, &code, "The tile was replaced by a later one", detail),
+            StitchError::Incomplete { .. } => Self::new(409, &code, "The image is not complete", detail),
+            StitchError::Exr(ExrError::TileSize(_) | ExrError::Attribute(_)) => {
+                Self::new(400, "bad_parameter", "The EXR cannot be like that", detail)
+            }
+            StitchError::Canvas(inner) => storage(inner.code(), detail),
+            StitchError::Exr(inner) => storage(inner.code(), detail),
+            StitchError::Mismatch(_) => internal(detail),
+        }
+    }
+}
+
+impl From<ExrError> for Problem {
+    fn from(error: ExrError) -> Self {
+        StitchError::from(error).into()
+    }
+}
+
+impl From<PictureError> for Problem {
+    fn from(error: PictureError) -> Self {
+        match error {
+            PictureError::Encode(detail) => internal(detail),
+            error => storage(error.code(), error),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_answer_is_problem_json_and_says_when_to_come_again() {
+        let deadline = std::time::Duration::from_millis(200);
+        let refusal = Refusal::from(AdmissionError::Busy { needed: 5, deadline });
+        let response = refusal.into_response();
+        assert_eq!(response.status(), 503);
+        assert_eq!(response.headers()["content-type"], "application/problem+json");
+        assert_eq!(response.headers()["retry-after"], "1");
+    }
+
+    #[test]
+    fn codes_are_snake_case() {
+        let rect = Rect::new(0, 0, 1, 1);
+        for error in [StitchError::Conflict(rect), StitchError::Overlap { core: rect, other: rect }] {
+            let problem = Problem::from(error);
+            assert!(problem.code.bytes().all(|b| b == b'_' || b.is_ascii_lowercase()), "{}", problem.code);
+        }
+    }
+}

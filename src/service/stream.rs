@@ -1,0 +1,346 @@
+//! A tile stream in, results out: `POST /v1/filter` and `POST /v1/images/{id}/tiles`.
+//!
+//! Until the first tile's samples are all here a failure is an HTTP status. From then on the answer has begun: failures
+//! are messages in it, and it always ends with the number of tiles that were filtered and that were not.
+
+use std::{
+    io,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Instant,
+};
+
+use axum::{
+    body::Body,
+    extract::{Request, State},
+    http::{StatusCode, header},
+    response::{IntoResponse, Response},
+};
+use futures_util::StreamExt;
+use rayon::ThreadPool;
+use serde_json::json;
+use tokio::task::JoinSet;
+
+use super::{
+    Shared,
+    body::Frames,
+    images::{Id, Image, Outcome},
+    picture::{CorePixels, encode_png, write_picture},
+    problem::{Refusal, corners, internal},
+    query::{Form, Parameters, attributes},
+    receive::{Fault, Received, Receiver},
+    results::{Results, file_response},
+    work::{Stop, blocking},
+};
+use crate::{
+    filter::{Execution, Filtered, Method, Rect, SampleTile, filter},
+    stitch::ExrOptions,
+    wire::{Header, Problem, TileReport, message},
+};
+
+/// One request: how to filter, and where results go.
+pub(super) struct Call {
+    pub(super) service: Shared,
+    pub(super) method: Arc<Method>,
+    pub(super) seed: u64,
+    pub(super) target: Target,
+}
+
+/// Where results go.
+pub(super) enum Target {
+    /// Back to the client.
+    Client,
+    /// Onto an image's canvas.
+    Image {
+        image: Arc<Image>,
+        /// Whether a stored core made from other samples is replaced.
+        replace: bool,
+    },
+}
+
+/// A tile, filtered.
+struct Done {
+    filtered: Filtered,
+    report: TileReport,
+}
+
+impl Call {
+    /// Says whether a tile with this header is wanted here.
+    pub(super) fn check(&self, header: &Header) -> Result<(), Refusal> {
+        match &self.target {
+            Target::Client => Ok(()),
+            Target::Image { image, .. } => image.check(header.geometry().image(), header.channels()),
+        }
+    }
+
+    /// Filters a tile; its samples, and the memory they took, are free afterwards. `None`: it was stopped.
+    fn filter(&self, tile: SampleTile, mut held: Held, pool: &ThreadPool, stop: &AtomicBool) -> Option<(Done, Held)> {
+        let started = Instant::now();
+        let execution = Execution { seed: self.seed, pool: Some(pool), stop: Some(stop), ..Execution::default() };
+        let filtered = filter(&tile, &self.method, &execution).ok()?;
+        drop(tile);
+        held.permit.shrink_to(held.output);
+        let seconds = started.elapsed().as_secs_f64();
+        let report = TileReport::new(&filtered.report, &self.method, self.seed, seconds);
+        tracing::debug!(tile = %filtered.core, seconds, samples = report.samples, exact = report.exact, "tile filtered");
+        Some((Done { filtered, report }, held))
+    }
+
+    /// All that is done with a tile, on a thread that may block.
+    fn process(
+        &self,
+        received: Received,
+        results: &Results,
+        pool: &ThreadPool,
+        stop: &AtomicBool,
+    ) -> Result<(), Refusal> {
+        if stop.load(Ordering::Relaxed) {
+            return Ok(());
+        }
+        let geometry = *received.assembler.header().geometry();
+        let Received { assembler, plan, permit } = received;
+        let held = Held { permit, output: plan.output };
+        let tile = assembler.finish()?;
+        match &self.target {
+            Target::Client => {
+                let Some((Done { filtered, report }, _held)) = self.filter(tile, held, pool, stop) else {
+                    return Ok(());
+                };
+                let image = [geometry.image().width, geometry.image().height];
+                results.append(|mut out| message::encode_result(image, &filtered, &report, &mut out))?;
+            }
+            Target::Image { image, replace } => {
+                let state = match image.offer(&tile, *replace)? {
+                    Outcome::Repeated => "repeated",
+                    Outcome::Filter(claim) => {
+                        let Some((Done { filtered, report }, _held)) = self.filter(tile, held, pool, stop) else {
+                            return Ok(());
+                        };
+                        image.add(claim, &filtered, report.seconds)?
+                    }
+                };
+                let line = json!({ "tile": corners(geometry.core()), "state": state });
+                results.append(|out| writeln!(out, "{line}"))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes a failure in a result's place.
+    async fn report(&self, results: &Arc<Results>, tile: Option<Rect>, problem: Box<Problem>) {
+        tracing::debug!(tile = tile.map(tracing::field::display), code = problem.code, "tile refused");
+        let (results, lines) = (Arc::clone(results), self.lines());
+        let written = blocking(move || {
+            results.append(|mut out| {
+                if lines {
+                    let line = json!({ "tile": tile.map(corners), "state": "error", "problem": problem });
+                    return writeln!(out, "{line}");
+                }
+                message::encode_error(tile, &problem, &mut out)
+            })
+        });
+        log(written.await);
+    }
+
+    /// Writes the end of a result stream. If even that fails the connection is cut, which shows as well.
+    async fn end(&self, results: Arc<Results>, tiles: u64, errors: u64) {
+        let lines = self.lines();
+        let written = blocking(move || {
+            results.append(|mut out| {
+                if lines {
+                    let line = json!({ "state": "end", "tiles": tiles, "errors": errors });
+                    return writeln!(out, "{line}");
+                }
+                message::encode_end(tiles, errors, &mut out)
+            })?;
+            results.finish();
+            Ok(())
+        });
+        log(written.await);
+    }
+
+    const fn lines(&self) -> bool {
+        matches!(self.target, Target::Image { .. })
+    }
+}
+
+/// Memory that a tile holds, and how much of it its result needs.
+struct Held {
+    permit: crate::admission::Permit,
+    output: u64,
+}
+
+/// Says what cannot be said to the client.
+fn log(written: Result<io::Result<()>, Refusal>) {
+    if let Ok(Err(error)) = written {
+        internal(format_args!("results cannot be written: {error}"));
+    }
+}
+
+/// `POST /v1/filter`.
+pub(super) async fn filter_stream(State(service): State<Shared>, request: Request) -> Result<Response, Refusal> {
+    let form = Form::accepted(request.headers())?;
+    let (method, seed) = Parameters::of_query(request.uri())?.method()?;
+    let call = Call { service, method: Arc::new(method), seed, target: Target::Client };
+    match form {
+        Form::Messages => answer(call, request, form.media()).await,
+        Form::Exr | Form::Png => single(call, request, form).await,
+    }
+}
+
+/// `POST /v1/images/{id}/tiles`.
+pub(super) async fn image_tiles(State(service): State<Shared>, id: Id, request: Request) -> Result<Response, Refusal> {
+    let image = service.images.find(&id)?;
+    let mut parameters = Parameters::of_query(request.uri())?;
+    let replace = parameters.flag("replace")?;
+    parameters.done("replace")?;
+    let (method, seed) = (Arc::clone(&image.method), image.seed);
+    let call = Call { service, method, seed, target: Target::Image { image, replace } };
+    answer(call, request, "application/x-ndjson").await
+}
+
+fn receiver(call: &Call, request: Request) -> Result<Receiver, Refusal> {
+    let (parts, body) = request.into_parts();
+    Ok(Receiver::new(Frames::new(&parts.headers, body, call.service.config.idle_deadline)?))
+}
+
+/// The first tile; a failure is the answer to the whole request.
+async fn first(call: &Call, receiver: &mut Receiver) -> Result<Received, Refusal> {
+    match receiver.next(call).await {
+        Ok(Some(received)) => Ok(received),
+        // A stream without tiles has failed to decode.
+        Ok(None) => Err(internal("a stream without tiles was accepted").into()),
+        Err(fault) => Err(fault.into_refusal()),
+    }
+}
+
+/// Answers with a result stream.
+async fn answer(call: Call, request: Request, media: &'static str) -> Result<Response, Refusal> {
+    let mut receiver = receiver(&call, request)?;
+    let received = first(&call, &mut receiver).await?;
+    let folder = call.service.config.data_dir.clone();
+    let (results, reader) = blocking(move || Results::new(&folder)).await??;
+    let stop = Stop::default();
+    let session = tokio::spawn(session(Arc::new(call), receiver, received, Arc::new(results), stop.flag()));
+    // The body is dropped when all is sent, or when the client has gone.
+    let guard = Guard { session, _stop: stop };
+    let body = reader.inspect(move |_| {
+        let _ = &guard;
+    });
+    Ok((StatusCode::OK, [(header::CONTENT_TYPE, media)], Body::from_stream(body)).into_response())
+}
+
+/// Ends a session when it is dropped.
+struct Guard {
+    session: tokio::task::JoinHandle<()>,
+    _stop: Stop,
+}
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        self.session.abort();
+    }
+}
+
+/// Reads and filters tiles until the stream ends. Results are written as they are done, in any order.
+async fn session(
+    call: Arc<Call>,
+    mut receiver: Receiver,
+    received: Received,
+    results: Arc<Results>,
+    stop: Arc<AtomicBool>,
+) {
+    let started = Instant::now();
+    let (mut tiles, mut errors) = (0, 0);
+    let mut count = |fine: Option<Result<bool, _>>| match fine {
+        Some(Ok(true)) => tiles += 1,
+        _ => errors += 1,
+    };
+    let mut jobs: JoinSet<bool> = JoinSet::new();
+    let mut next = Ok(Some(received));
+    loop {
+        match next {
+            Ok(Some(received)) => {
+                jobs.spawn(job(Arc::clone(&call), received, Arc::clone(&results), Arc::clone(&stop)));
+                // One more than can run, so that there always is one to run.
+                if jobs.len() > call.service.work.jobs() {
+                    count(jobs.join_next().await);
+                }
+            }
+            Ok(None) => break,
+            Err(Fault::Tile(core, refusal)) => {
+                call.report(&results, Some(core), refusal.0).await;
+                count(Some(Ok(false)));
+            }
+            Err(Fault::Stream(tile, refusal)) => {
+                // All that came before is done first: nothing follows this error.
+                while let Some(fine) = jobs.join_next().await {
+                    count(Some(fine));
+                }
+                call.report(&results, tile, refusal.0).await;
+                count(Some(Ok(false)));
+                break;
+            }
+        }
+        next = receiver.next(&call).await;
+    }
+    while let Some(fine) = jobs.join_next().await {
+        count(Some(fine));
+    }
+    tracing::info!(tiles, errors, seconds = started.elapsed().as_secs_f64(), "tile stream done");
+    call.end(results, tiles, errors).await;
+}
+
+/// One tile, from its samples to its place among the results. Says whether it went well.
+async fn job(call: Arc<Call>, received: Received, results: Arc<Results>, stop: Arc<AtomicBool>) -> bool {
+    let core = received.core();
+    let (inner, out) = (Arc::clone(&call), Arc::clone(&results));
+    let done = call.service.work.run(move |pool| inner.process(received, &out, pool, &stop)).await;
+    match done.flatten() {
+        Ok(()) => true,
+        Err(refusal) => {
+            call.report(&results, Some(core), refusal.0).await;
+            false
+        }
+    }
+}
+
+/// Answers with a picture of a single tile.
+async fn single(call: Call, request: Request, form: Form) -> Result<Response, Refusal> {
+    let mut receiver = receiver(&call, request)?;
+    let received = first(&call, &mut receiver).await?;
+    receiver.end(&call).await?;
+    let stop = Stop::default();
+    let flag = stop.flag();
+    let call = Arc::new(call);
+    let inner = Arc::clone(&call);
+    let file = call.service.work.run(move |pool| picture(&inner, received, form, pool, &flag)).await??;
+    Ok(file_response(file, form.media()).await?)
+}
+
+fn picture(
+    call: &Call,
+    received: Received,
+    form: Form,
+    pool: &ThreadPool,
+    stop: &AtomicBool,
+) -> Result<std::fs::File, Refusal> {
+    let Received { assembler, plan, permit } = received;
+    let geometry = *assembler.header().geometry();
+    let held = Held { permit, output: plan.output };
+    let filtered = call.filter(assembler.finish()?, held, pool, stop);
+    let Some((done, _held)) = filtered else {
+        return Err(Problem::new(503, "stopped", "The work was stopped", "the client has gone").into());
+    };
+    let mut options = ExrOptions { attributes: attributes(&call.method, call.seed), ..ExrOptions::default() };
+    if geometry.core() != geometry.image() {
+        options.attributes.insert("rpfd:tile".into(), geometry.core().to_string());
+    }
+    let pixels = CorePixels(&done.filtered);
+    write_picture(&call.service.config.data_dir, |out| match form {
+        Form::Png => encode_png(&pixels, out),
+        _ => Ok(crate::stitch::exr::encode(&pixels, &options, out).map(drop)?),
+    })
+}

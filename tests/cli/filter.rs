@@ -1,0 +1,146 @@
+//! `rpfd filter`: the same EXR whatever the tiling and the memory, and what it reports.
+
+use super::*;
+use rpfd::report::errors;
+
+#[test]
+fn the_default_preset_denoises() {
+    let folder = Folder::new();
+    let (input, out, png) = (data("small.tiles.zst"), folder.path("out.exr"), folder.path("out.png"));
+    let input = input.to_str().unwrap();
+    let report = json(["filter", input, "-o", &out, "--png", &png]);
+    assert_eq!((&report["preset"], &report["seed"]), (&"lean".into(), &0.into()));
+    assert_eq!((&report["samples"], &report["missing_pixels"]), (&(48 * 48 * 4).into(), &0.into()));
+    assert_eq!(report["short_of_halo"], 0);
+    assert_eq!(report["parameters"]["boxes"], "17,7");
+    assert_eq!(report["files"][0]["bytes"], bytes(&out).len());
+    let left_out: Vec<_> =
+        report["left_out"].as_array().unwrap().iter().map(|l| l["plane"].as_str().unwrap()).collect();
+    assert_eq!(left_out, ["lens.0", "lens.1"]);
+    assert!(bytes(&png).starts_with(b"\x89PNG"));
+
+    let plain = folder.path("plain.exr");
+    json(["filter", input, "-o", &plain, "--preset", "unfiltered"]);
+    let reference = read_exr(data("small.reference.exr"));
+    let error = |path: &str| errors(&read_exr(path).pixels, &reference.pixels).unwrap().relmse;
+    assert!(error(&out) < 0.5 * error(&plain), "{} against {}", error(&out), error(&plain));
+    assert_eq!(folder.names(), ["out.exr", "out.png", "plain.exr"]);
+}
+
+/// Bare cores, tiles with halo, one huge tile, shuffled tiles, memory that is plenty or scarce, one thread or two.
+fn same_bits(extra: &[&str], preset: &[&str]) {
+    let folder = Folder::new();
+    let common = ["--size", "150x81", "--spp", "2", "--scene", "all"];
+    let synth = |name: &str, args: &[&str]| folder.synth(name, &[&common, extra, args].concat());
+    let bare = synth("bare.tiles", &["--tile", "32"]);
+    let haloed = synth("haloed.tiles.zst", &["--tile", "64", "--halo", "60"]);
+    let huge = synth("huge.tiles", &["--tile", "1000"]);
+    let shuffled = folder.path("shuffled.tiles");
+    copy_tiles(&bare, &shuffled, 5, |_| 1);
+    let out = folder.path("out.exr");
+    let mut expected = None;
+    let mut check = |input: &str, args: &[&str]| {
+        let report = json([&["filter", input, "-o", &out], preset, args].concat());
+        assert_eq!(report["short_of_halo"], 0);
+        let exr = bytes(&out);
+        assert_eq!(&exr, expected.get_or_insert_with(|| exr.clone()), "{input} {args:?}");
+        report
+    };
+    let plenty = check(&bare, &["--threads", "2"]);
+    assert_eq!(plenty["spool"]["in"], "memory");
+    assert_eq!(plenty["tiling"]["cut"], 512);
+    for (input, threads) in [(&haloed, "2"), (&huge, "1")] {
+        let report = check(input, &["--threads", threads]);
+        assert_eq!((&report["tiling"], &report["spool"]), (&"as they come".into(), &Value::Null));
+    }
+    check(&shuffled, &["--threads", "1"]);
+
+    // One byte less than all of it takes, and the spool goes to disk; less still, and tiles get smaller.
+    let memory = (plenty["memory"]["planned"].as_u64().unwrap() - 1).to_string();
+    let report = check(&bare, &["--threads", "2", "--memory", &memory]);
+    assert_eq!(report["spool"]["in"], "disk");
+    let (code, message) =
+        fails(2, [&["filter", &huge, "-o", &out, "--memory", "1MiB", "--threads", "2"], preset].concat());
+    assert_eq!(code, "memory");
+    let least = message.rsplit("at least ").next().unwrap();
+    let report = check(&huge, &["--memory", least, "--threads", "2"]);
+    assert_eq!(report["spool"]["in"], "disk");
+    assert!(report["tiles"].as_u64() > Some(1) && report["tiling"]["cut"].as_u64() < Some(128), "{report}");
+    assert_eq!(folder.names(), ["bare.tiles", "haloed.tiles.zst", "huge.tiles", "out.exr", "shuffled.tiles"]);
+}
+
+#[test]
+fn same_bits_whatever_the_tiling_and_the_memory() {
+    same_bits(&[], &[]);
+}
+
+#[test]
+fn same_bits_where_counts_vary() {
+    same_bits(&["--varying"], &["--seed", "3"]);
+}
+
+#[test]
+fn same_bits_with_a_wide_reach() {
+    same_bits(&[], &["--preset", "paper-fast", "--set", "boxes=41,9", "--set", "fractions=0.02,0.1"]);
+}
+
+#[test]
+fn less_halo_than_the_preset_reads_is_made_up_for() {
+    let folder = Folder::new();
+    let common = ["--size", "70x40", "--spp", "2"];
+    let narrow = folder.synth("narrow.tiles", &[&common[..], &["--tile", "16", "--halo", "3"]].concat());
+    let huge = folder.synth("huge.tiles", &[&common[..], &["--tile", "100"]].concat());
+    let (a, b) = (folder.path("a.exr"), folder.path("b.exr"));
+    let report = json(["filter", &narrow, "-o", &a]);
+    assert_eq!(report["short_of_halo"], 0);
+    json(["filter", &huge, "-o", &b]);
+    assert!(bytes(a) == bytes(b));
+}
+
+#[test]
+fn missing_tiles_are_refused_unless_partial() {
+    let folder = Folder::new();
+    let all = folder.synth("all.tiles", &["--size", "64x48", "--spp", "2", "--tile", "16"]);
+    let some = folder.path("some.tiles");
+    copy_tiles(&all, &some, 0, |tile| usize::from(tile != 5));
+    let out = folder.path("out.exr");
+    let (code, message) = fails(3, ["filter", &some, "-o", &out]);
+    assert_eq!(code, "missing");
+    assert!(message.contains("[16, 16, 16, 16]") && message.contains("--partial"), "{message}");
+    assert_eq!(folder.names(), ["all.tiles", "some.tiles"]);
+
+    let report = json(["filter", &some, "-o", &out, "--partial"]);
+    assert_eq!(report["missing_pixels"], 256);
+    let image = read_exr(&out);
+    let black = |x: u32, y: u32| image.pixels[(y * 64 + x) as usize] == [0.0; 3];
+    assert!((16..32).all(|y| (16..32).all(|x| black(x, y))) && !black(8, 8) && !black(40, 24));
+
+    // What is there does not depend on the tiles that it is cut into.
+    let (shuffled, again) = (folder.path("shuffled.tiles"), folder.path("again.exr"));
+    copy_tiles(&some, &shuffled, 9, |_| 1);
+    let least = fails(2, ["filter", &some, "-o", &again, "--partial", "--memory", "1MiB"]).1;
+    json(["filter", &shuffled, "-o", &again, "--partial", "--memory", least.rsplit("at least ").next().unwrap()]);
+    assert!(bytes(out) == bytes(again));
+}
+
+#[test]
+fn the_exr_is_as_asked_for() {
+    let folder = Folder::new();
+    let input = data("small.tiles.zst").into_os_string().into_string().unwrap();
+    let base = ["filter", &input, "--preset", "unfiltered", "-o"];
+    let float = folder.path("float.exr");
+    json(base.into_iter().chain([&*float]));
+    let expected = read_exr(&float);
+    for options in
+        [&["--half"][..], &["--exr-samples", "half", "--compression", "piz"], &["--exr-tiles", "16", "--float"]]
+    {
+        let out = folder.path("out.exr");
+        json(base.iter().chain([&&*out]).chain(options));
+        assert_ne!(bytes(&out), bytes(&float));
+        let half = !options.contains(&"--float");
+        for (got, expected) in read_exr(&out).pixels.as_flattened().iter().zip(expected.pixels.as_flattened()) {
+            let tolerance = if half { 1e-3 * expected + 1e-7 } else { 0.0 };
+            assert!((got - expected).abs() <= tolerance, "{got} is not {expected}");
+        }
+    }
+}

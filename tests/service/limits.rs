@@ -1,0 +1,197 @@
+//! Memory is bounded, and given back.
+
+use super::{Answer, Server, encode, head, samples, tile, whole};
+use rpfd::{
+    config::Config,
+    filter::{Channel, ChannelSet, Method, Rect, Role, TileGeometry, plan::plan},
+    service::Service,
+    wire::{Format, Header, Message, SampleCounts, encode_header},
+};
+use std::{
+    io::Write,
+    time::{Duration, Instant},
+};
+
+const IMAGE: [u32; 2] = [64, 64];
+
+/// Memory that this tile needs, as an argument, with room for rounding.
+fn memory(side: u32, preset: &str) -> String {
+    let tile = samples(IMAGE, Rect::new(0, 0, side, side), 0, 1);
+    let header = Header::of(&tile, Format::F32).unwrap();
+    (plan(&header.shape(), &Method::preset(preset).unwrap()).total(2) + 1024).to_string()
+}
+
+#[test]
+fn a_tile_that_never_fits_is_told_the_size_that_would() {
+    let server = Server::start(&["--memory", "1MiB"]);
+    let problem = server.post("/v1/filter", &whole(64)).problem(413, "over_memory");
+    assert!(problem["needed"].as_u64() > problem["available"].as_u64());
+    let fits = problem["fits"][0].as_u64().unwrap() as u32;
+    assert!(problem["detail"].as_str().unwrap().contains(&format!("{fits} x {fits}")), "{problem}");
+    let with = |side| server.post("/v1/filter", &tile(IMAGE, Rect::new(0, 0, side, side), 0));
+    assert_eq!(with(fits).messages().len(), 2);
+    with(fits + 1).problem(413, "over_memory");
+}
+
+#[test]
+fn varying_counts_are_admitted_by_their_upper_bound() {
+    let server = Server::start(&["--memory", "64MiB"]);
+    let geometry = TileGeometry::with_halo(IMAGE, Rect::new(0, 0, 24, 24), 4).unwrap();
+    let scene = rpfd::synth::Scene::by_name("all").unwrap();
+    let tile = scene.tile_varying(geometry, 6, &rpfd::filter::Execution::default()).unwrap();
+    assert_eq!(server.post("/v1/filter", &encode(&tile)).messages().len(), 2);
+}
+
+#[test]
+fn a_full_budget_is_503_until_it_is_free_again() {
+    let server = Server::start(&["--memory", &memory(48, "lean"), "--queue-deadline", "0.3"]);
+    let body = tile(IMAGE, Rect::new(0, 0, 48, 48), 0);
+    // This client sends half of a tile and then nothing.
+    let mut slow = server.connect();
+    slow.write_all(head("POST", "/v1/filter", &[], body.len()).as_bytes()).unwrap();
+    slow.write_all(&body[..body.len() / 2]).unwrap();
+    std::thread::sleep(Duration::from_millis(200));
+    let answer = server.post("/v1/filter", &body);
+    answer.problem(503, "busy");
+    assert!(answer.header("retry-after").unwrap().parse::<u64>().unwrap() >= 1);
+    // What needs no memory is answered all the same.
+    assert_eq!(server.get("/livez").status, 200);
+    assert_eq!(server.get("/readyz").status, 200);
+    drop(slow);
+    std::thread::sleep(Duration::from_millis(100));
+    assert_eq!(server.post("/v1/filter", &body).messages().len(), 2);
+}
+
+#[test]
+fn a_client_that_disappears_stops_its_work_and_frees_its_memory() {
+    let server = Server::start(&["--memory", &memory(48, "paper"), "--queue-deadline", "5"]);
+    let body = tile(IMAGE, Rect::new(0, 0, 48, 48), 0);
+    for accept in ["Accept: application/msgpack", "Accept: image/x-exr"] {
+        let mut gone = server.connect();
+        gone.write_all(head("POST", "/v1/filter?preset=paper", &[accept], body.len()).as_bytes()).unwrap();
+        gone.write_all(&body).unwrap();
+        std::thread::sleep(Duration::from_millis(300));
+        drop(gone);
+        let started = Instant::now();
+        let answer = server.post("/v1/filter?preset=unfiltered", &body);
+        assert_eq!(answer.status, 200, "{}", String::from_utf8_lossy(&answer.body));
+        assert!(started.elapsed() < Duration::from_secs(4));
+    }
+}
+
+#[test]
+fn nobody_has_to_read_while_sending() {
+    let server = Server::start(&["--memory", "16MiB"]);
+    // More than sockets buffer, both ways: 60 tiles of 0.4 MB, results of 0.8 MB.
+    let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+    let side = 256;
+    let tiles: Vec<u8> = (0..60)
+        .flat_map(|i| {
+            let geometry = TileGeometry::with_halo([side * 60, side], Rect::new(side * i, 0, side, side), 0).unwrap();
+            let header = Header::new(geometry, channels.clone(), SampleCounts::Uniform(1), Format::F16).unwrap();
+            let mut bytes = encode_header(&header);
+            for _ in 0..3 {
+                bytes.extend([0xc6, 0, 2, 0, 0]);
+                bytes.extend((0..side * side).flat_map(|i| (0x3800 + (i % 700) as u16).to_le_bytes()));
+            }
+            bytes
+        })
+        .collect();
+    let mut stream = server.connect();
+    stream.set_write_timeout(Some(Duration::from_secs(30))).unwrap();
+    stream.write_all(head("POST", "/v1/filter?preset=unfiltered", &[], tiles.len()).as_bytes()).unwrap();
+    stream.write_all(&tiles).expect("the service takes everything while nothing is read");
+    let messages = Answer::read(&mut stream).messages();
+    assert_eq!(messages.last(), Some(&Message::End { tiles: 60, errors: 0 }));
+    assert_eq!(messages.len(), 61);
+}
+
+#[test]
+fn a_client_that_only_sends_gets_its_refusal() {
+    let server = Server::start(&["--memory", "1MiB"]);
+    let body = whole(320);
+    let zstd = ["Content-Encoding: zstd"];
+    for (path, headers, status, code) in [
+        ("/v1/filter?preset=x", &[][..], 400, "unknown_preset"),
+        ("/v1/images/x/tiles", &[], 404, "unknown_image"),
+        ("/v1/filter", &[], 413, "over_memory"),
+        ("/v1/filter", &zstd, 400, "compression"),
+    ] {
+        let mut stream = server.connect();
+        stream.write_all(head("POST", path, headers, body.len()).as_bytes()).unwrap();
+        stream.write_all(&body).expect("the service takes what it has refused");
+        Answer::read(&mut stream).problem(status, code);
+    }
+}
+
+#[test]
+fn an_idle_body_is_given_up() {
+    let server = Server::start(&["--idle-deadline", "0.2"]);
+    let body = whole(16);
+    let mut stream = server.connect();
+    stream.write_all(head("POST", "/v1/filter", &[], body.len()).as_bytes()).unwrap();
+    stream.write_all(&body[..100]).unwrap();
+    Answer::read(&mut stream).problem(408, "body_timeout");
+}
+
+#[test]
+fn it_stops_when_told_to_after_what_has_begun() {
+    // Half a head is not waited for longer than that.
+    let server = Server::start(&["--header-deadline", "1"]);
+    let mut idle = server.connect();
+    idle.write_all(b"GET /livez HTTP/1.1\r\n").unwrap();
+    let body = whole(32);
+    let mut busy = server.connect();
+    busy.write_all(head("POST", "/v1/filter", &[], body.len()).as_bytes()).unwrap();
+    busy.write_all(&body[..body.len() / 2]).unwrap();
+    std::thread::sleep(Duration::from_millis(200));
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            std::thread::sleep(Duration::from_millis(300));
+            busy.write_all(&body[body.len() / 2..]).unwrap();
+            assert_eq!(Answer::read(&mut busy).messages().len(), 2);
+        });
+        assert_eq!(server.terminate().code(), Some(0));
+    });
+}
+
+#[test]
+fn a_wrong_configuration_is_refused_all_at_once() {
+    let serve = |arguments: &[&str]| {
+        let command = std::process::Command::new(env!("CARGO_BIN_EXE_rpfd")).arg("serve").args(arguments).output();
+        let output = command.unwrap();
+        (output.status.code(), String::from_utf8(output.stderr).unwrap())
+    };
+    let (code, message) = serve(&["--listen", "127.0.0.1:0", "--memory", "0", "--threads", "0"]);
+    assert_eq!(code, Some(2));
+    assert!(message.contains("memory") && message.contains("threads") && message.contains("bad_config"), "{message}");
+    assert_eq!(serve(&["--memory", "lots"]).0, Some(2));
+    let (code, message) = serve(&["--listen", "127.0.0.1:0", "--data-dir", "/dev/null/x"]);
+    assert_eq!(code, Some(1));
+    assert!(message.contains("/dev/null/x") && message.contains("data_dir"), "{message}");
+}
+
+#[test]
+fn it_runs_in_process_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = Config {
+        listen: "127.0.0.1:0".parse().unwrap(),
+        data_dir: folder.path().join("made/for/it"),
+        threads: 1,
+        ..Config::default()
+    };
+    let service = Service::bind(config).unwrap();
+    let address = service.local_addr();
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    let thread = std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(service.run(async { drop(stopped.await) }))
+    });
+    let mut stream = std::net::TcpStream::connect(address).unwrap();
+    let body = whole(16);
+    stream.write_all(head("POST", "/v1/filter", &[], body.len()).as_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    assert_eq!(Answer::read(&mut stream).messages().len(), 2);
+    stop.send(()).unwrap();
+    thread.join().unwrap().unwrap();
+}

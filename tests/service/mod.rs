@@ -1,0 +1,200 @@
+//! The service over HTTP: the real binary on a free port.
+
+mod bad_input;
+mod curl;
+mod exact;
+mod images;
+mod limits;
+
+use std::{
+    io::{BufRead, BufReader, Read, Write},
+    net::TcpStream,
+    path::Path,
+    process::{Child, Command, Stdio},
+    time::Duration,
+};
+
+use rpfd::{
+    filter::{Execution, Rect, SampleTile, TileGeometry},
+    synth::Scene,
+    wire::{Format, Header, Message, ResultDecoder, encode_tile},
+};
+use serde_json::Value;
+
+/// A running service, which ends with this.
+pub(crate) struct Server {
+    child: Child,
+    pub(crate) address: String,
+    folder: tempfile::TempDir,
+}
+
+impl Server {
+    pub(crate) fn start(arguments: &[&str]) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let mut child = Command::new(env!("CARGO_BIN_EXE_rpfd"))
+            .args(["serve", "--listen", "127.0.0.1:0", "--threads", "2", "--data-dir"])
+            .arg(folder.path())
+            .args(arguments)
+            .env("RUST_LOG", "warn")
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let address = line.trim().rsplit("//").next().unwrap().to_owned();
+        assert!(!address.is_empty(), "the service did not start");
+        Self { child, address, folder }
+    }
+
+    pub(crate) fn data_dir(&self) -> &Path {
+        self.folder.path()
+    }
+
+    pub(crate) fn connect(&self) -> TcpStream {
+        let stream = TcpStream::connect(&self.address).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+        stream
+    }
+
+    /// A request, all of it sent while the answer is read.
+    pub(crate) fn call(&self, method: &str, path: &str, headers: &[&str], body: &[u8]) -> Answer {
+        let mut stream = self.connect();
+        let mut writer = stream.try_clone().unwrap();
+        let head = head(method, path, headers, body.len());
+        std::thread::scope(|scope| {
+            // An early answer may close the connection under us.
+            scope.spawn(move || writer.write_all(head.as_bytes()).and_then(|()| writer.write_all(body)));
+            Answer::read(&mut stream)
+        })
+    }
+
+    pub(crate) fn get(&self, path: &str) -> Answer {
+        self.call("GET", path, &[], &[])
+    }
+
+    pub(crate) fn post(&self, path: &str, body: &[u8]) -> Answer {
+        self.call("POST", path, &[], body)
+    }
+
+    /// Tells it to stop, and says how it ended.
+    pub(crate) fn terminate(mut self) -> std::process::ExitStatus {
+        let id = self.child.id().to_string();
+        assert!(Command::new("kill").args(["-TERM", &id]).status().unwrap().success());
+        self.child.wait().unwrap()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+pub(crate) fn head(method: &str, path: &str, headers: &[&str], length: usize) -> String {
+    let headers: String = headers.iter().map(|header| format!("{header}\r\n")).collect();
+    format!("{method} {path} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n{headers}Content-Length: {length}\r\n\r\n")
+}
+
+#[derive(Debug)]
+pub(crate) struct Answer {
+    pub(crate) status: u16,
+    pub(crate) headers: Vec<(String, String)>,
+    pub(crate) body: Vec<u8>,
+}
+
+impl Answer {
+    /// Reads an answer up to the end of the connection.
+    pub(crate) fn read(stream: &mut TcpStream) -> Self {
+        let mut bytes = Vec::new();
+        // A connection that is reset after the answer is as good as one that ends.
+        let _ = stream.read_to_end(&mut bytes);
+        let end = bytes.windows(4).position(|w| w == b"\r\n\r\n").expect("an answer");
+        let head = String::from_utf8(bytes[..end].to_vec()).unwrap();
+        let mut lines = head.lines();
+        let status = lines.next().unwrap().split(' ').nth(1).unwrap().parse().unwrap();
+        let headers: Vec<(String, String)> = lines
+            .map(|line| line.split_once(": ").unwrap())
+            .map(|(name, value)| (name.to_ascii_lowercase(), value.to_owned()))
+            .collect();
+        let mut body = bytes.split_off(end + 4);
+        if headers.iter().any(|(name, value)| name == "transfer-encoding" && value == "chunked") {
+            body = unchunked(&body);
+        }
+        Self { status, headers, body }
+    }
+
+    pub(crate) fn header(&self, name: &str) -> Option<&str> {
+        self.headers.iter().find(|(n, _)| n == name).map(|(_, value)| value.as_str())
+    }
+
+    pub(crate) fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).unwrap_or_else(|_| panic!("{self:?}"))
+    }
+
+    /// The lines of NDJSON.
+    pub(crate) fn lines(&self) -> Vec<Value> {
+        assert_eq!(self.status, 200, "{}", String::from_utf8_lossy(&self.body));
+        assert_eq!(self.header("content-type"), Some("application/x-ndjson"));
+        self.body.split(|&b| b == b'\n').filter(|l| !l.is_empty()).map(|l| serde_json::from_slice(l).unwrap()).collect()
+    }
+
+    /// The messages of a result stream, which must be whole.
+    pub(crate) fn messages(&self) -> Vec<Message> {
+        assert_eq!(self.status, 200, "{}", String::from_utf8_lossy(&self.body));
+        assert_eq!(self.header("content-type"), Some("application/msgpack"));
+        let (mut decoder, mut input, mut messages) = (ResultDecoder::new(), &self.body[..], Vec::new());
+        while let Some(message) = decoder.next(&mut input).unwrap() {
+            messages.push(message);
+        }
+        assert!(matches!(messages.last(), Some(Message::End { .. })), "no end: {messages:?}");
+        messages
+    }
+
+    /// Checks that it is a problem of this status and code, and gives it.
+    #[track_caller]
+    pub(crate) fn problem(&self, status: u16, code: &str) -> Value {
+        let text = String::from_utf8_lossy(&self.body);
+        assert_eq!(self.status, status, "{text}");
+        assert_eq!(self.header("content-type"), Some("application/problem+json"), "{text}");
+        let problem = self.json();
+        assert_eq!((problem["code"].as_str(), problem["status"].as_u64()), (Some(code), Some(status.into())), "{text}");
+        assert!(!problem["detail"].as_str().unwrap().is_empty());
+        problem
+    }
+}
+
+fn unchunked(mut bytes: &[u8]) -> Vec<u8> {
+    let mut body = Vec::new();
+    loop {
+        let line = bytes.windows(2).position(|w| w == b"\r\n").expect("the answer was cut off");
+        let size = usize::from_str_radix(std::str::from_utf8(&bytes[..line]).unwrap(), 16).unwrap();
+        if size == 0 {
+            return body;
+        }
+        body.extend_from_slice(&bytes[line + 2..line + 2 + size]);
+        bytes = &bytes[line + 4 + size..];
+    }
+}
+
+/// Samples of the scene that has everything, 4 in each pixel.
+pub(crate) fn samples(image: [u32; 2], core: Rect, halo: u32, seed: u64) -> SampleTile {
+    let geometry = TileGeometry::with_halo(image, core, halo).unwrap();
+    let execution = Execution { seed, ..Execution::default() };
+    Scene::by_name("all").unwrap().tile(geometry, 4, &execution).unwrap()
+}
+
+pub(crate) fn encode(tile: &SampleTile) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    encode_tile(&Header::of(tile, Format::F32).unwrap(), tile, &mut bytes).unwrap();
+    bytes
+}
+
+pub(crate) fn tile(image: [u32; 2], core: Rect, halo: u32) -> Vec<u8> {
+    encode(&samples(image, core, halo, 1))
+}
+
+/// A small image as one tile.
+pub(crate) fn whole(side: u32) -> Vec<u8> {
+    tile([side, side], Rect::new(0, 0, side, side), 0)
+}
