@@ -125,6 +125,16 @@ fn a_client_that_only_sends_gets_its_refusal() {
 }
 
 #[test]
+fn a_stream_waits_for_its_own_tiles_whatever_the_deadline() {
+    // Room for one tile, a deadline that filtering it takes longer than.
+    let server = Server::start(&["--memory", &memory(48, "paper-fast"), "--queue-deadline", "0.001"]);
+    let image = [144, 48];
+    let tiles: Vec<u8> = (0..3).flat_map(|i| tile(image, Rect::new(48 * i, 0, 48, 48), 0)).collect();
+    let messages = server.post("/v1/filter?preset=paper-fast", &tiles).messages();
+    assert_eq!(messages.last(), Some(&Message::End { tiles: 3, errors: 0 }), "{messages:?}");
+}
+
+#[test]
 fn an_idle_body_is_given_up() {
     let server = Server::start(&["--idle-deadline", "0.2"]);
     let body = whole(16);
