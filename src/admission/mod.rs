@@ -79,12 +79,27 @@ impl Budget {
     /// Reserves bytes, rounded up to whole KiB, after everyone who asked before; waits until `deadline` has passed.
     /// Giving up, or dropping the future, loses the place in the queue and holds nothing.
     pub async fn reserve(&self, bytes: u64, deadline: Duration) -> Result<Permit, AdmissionError> {
+        self.reserve_after(bytes, std::future::ready(()), deadline).await
+    }
+
+    /// As [`reserve`](Self::reserve), the deadline starting when `own` is done: whoever waits for bytes that he holds
+    /// himself, and that will become free, waits for nobody else.
+    pub async fn reserve_after(
+        &self,
+        bytes: u64,
+        own: impl Future<Output = ()>,
+        deadline: Duration,
+    ) -> Result<Permit, AdmissionError> {
         self.check(bytes)?;
-        let wanted = Arc::clone(&self.semaphore).acquire_many_owned(units(bytes));
-        match tokio::time::timeout(deadline, wanted).await {
-            Ok(Ok(permit)) => Ok(Permit { permit }),
+        let late = async {
+            own.await;
+            tokio::time::sleep(deadline).await;
+        };
+        tokio::select! {
+            biased;
             // The semaphore is never closed.
-            Ok(Err(_)) | Err(_) => Err(AdmissionError::Busy { needed: bytes, deadline }),
+            Ok(permit) = Arc::clone(&self.semaphore).acquire_many_owned(units(bytes)) => Ok(Permit { permit }),
+            () = late => Err(AdmissionError::Busy { needed: bytes, deadline }),
         }
     }
 }
@@ -116,7 +131,6 @@ impl Permit {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::future::Future;
 
     const SOON: Duration = Duration::from_millis(20);
     const LATER: Duration = Duration::from_secs(20);
@@ -183,6 +197,26 @@ mod tests {
             drop(held);
             let large = large.await.unwrap().unwrap();
             assert_eq!((large.bytes(), budget.free()), (8 * UNIT, 2 * UNIT));
+        });
+    }
+
+    #[test]
+    fn the_deadline_starts_after_ones_own_work() {
+        run(async {
+            let budget = Budget::new(10 * UNIT);
+            let held = budget.reserve(6 * UNIT, SOON).await.unwrap();
+            let own = async {
+                tokio::time::sleep(4 * SOON).await;
+            };
+            let work = async {
+                tokio::time::sleep(3 * SOON).await;
+                drop(held);
+            };
+            let (reserved, ()) = tokio::join!(budget.reserve_after(8 * UNIT, own, SOON), work);
+            let all = reserved.unwrap();
+            let own = tokio::time::sleep(SOON);
+            assert_eq!(budget.reserve_after(8 * UNIT, own, SOON).await.unwrap_err().code(), "busy");
+            drop(all);
         });
     }
 

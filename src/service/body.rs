@@ -28,6 +28,8 @@ use crate::wire::file::MAX_WINDOW_LOG;
 const BUFFER: usize = 64 << 10;
 /// How long the rest of a body is read, and thrown away, whose request was answered already.
 const LINGER: Duration = Duration::from_secs(10);
+/// How long it may bring nothing before that is given up.
+const LINGER_IDLE: Duration = Duration::from_secs(1);
 
 type Source = Pin<Box<dyn Stream<Item = io::Result<Bytes>> + Send>>;
 
@@ -152,7 +154,8 @@ impl Stream for Lingering {
 impl Drop for Lingering {
     fn drop(&mut self) {
         if let (Some(mut inner), false, Ok(runtime)) = (self.inner.take(), self.waits, Handle::try_current()) {
-            runtime.spawn(timeout(LINGER, async move { while let Some(Ok(_)) = inner.next().await {} }));
+            let rest = async move { while let Ok(Some(Ok(_))) = timeout(LINGER_IDLE, inner.next()).await {} };
+            runtime.spawn(timeout(LINGER, rest));
         }
     }
 }

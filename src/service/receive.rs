@@ -171,7 +171,8 @@ async fn admit(call: &Call, header: Header) -> Result<Open, Refusal> {
     if let Err(error) = budget.check(needed) {
         return Err(too_large(error, &header, &call.method, threads, budget));
     }
-    let permit = budget.reserve(needed, call.service.config.queue_deadline).await?;
+    // What this request's own tiles hold will be free again: that is no queue.
+    let permit = budget.reserve_after(needed, call.idle(), call.service.config.queue_deadline).await?;
     let received = Received { assembler: Assembler::new(&header), plan, permit };
     Ok(Open { received, counts: CountReader::default(), most: 0, counting: header.varying() })
 }

@@ -21,7 +21,7 @@ use axum::{
 use futures_util::StreamExt;
 use rayon::ThreadPool;
 use serde_json::json;
-use tokio::task::JoinSet;
+use tokio::{sync::watch, task::JoinSet};
 
 use super::{
     Shared,
@@ -46,6 +46,8 @@ pub(super) struct Call {
     pub(super) method: Arc<Method>,
     pub(super) seed: u64,
     pub(super) target: Target,
+    /// Tiles of this request that are being worked on.
+    busy: watch::Sender<usize>,
 }
 
 /// Where results go.
@@ -67,6 +69,16 @@ struct Done {
 }
 
 impl Call {
+    fn new(service: Shared, method: Arc<Method>, seed: u64, target: Target) -> Self {
+        Self { service, method, seed, target, busy: watch::Sender::new(0) }
+    }
+
+    /// Waits until none of this request's tiles is being worked on.
+    pub(super) async fn idle(&self) {
+        // The sender lives as long as this does.
+        let _ = self.busy.subscribe().wait_for(|&tiles| tiles == 0).await;
+    }
+
     /// Says whether a tile with this header is wanted here.
     pub(super) fn check(&self, header: &Header) -> Result<(), Refusal> {
         match &self.target {
@@ -183,7 +195,7 @@ fn log(written: Result<io::Result<()>, Refusal>) {
 pub(super) async fn filter_stream(State(service): State<Shared>, request: Request) -> Result<Response, Refusal> {
     let form = Form::accepted(request.headers())?;
     let (method, seed) = Parameters::of_query(request.uri())?.method()?;
-    let call = Call { service, method: Arc::new(method), seed, target: Target::Client };
+    let call = Call::new(service, Arc::new(method), seed, Target::Client);
     match form {
         Form::Messages => answer(call, request, form.media()).await,
         Form::Exr | Form::Png => single(call, request, form).await,
@@ -197,7 +209,7 @@ pub(super) async fn image_tiles(State(service): State<Shared>, id: Id, request: 
     let replace = parameters.flag("replace")?;
     parameters.done("replace")?;
     let (method, seed) = (Arc::clone(&image.method), image.seed);
-    let call = Call { service, method, seed, target: Target::Image { image, replace } };
+    let call = Call::new(service, method, seed, Target::Image { image, replace });
     answer(call, request, "application/x-ndjson").await
 }
 
@@ -263,6 +275,7 @@ async fn session(
     loop {
         match next {
             Ok(Some(received)) => {
+                call.busy.send_modify(|tiles| *tiles += 1);
                 jobs.spawn(job(Arc::clone(&call), received, Arc::clone(&results), Arc::clone(&stop)));
                 // One more than can run, so that there always is one to run.
                 if jobs.len() > call.service.work.jobs() {
@@ -298,6 +311,7 @@ async fn job(call: Arc<Call>, received: Received, results: Arc<Results>, stop: A
     let core = received.core();
     let (inner, out) = (Arc::clone(&call), Arc::clone(&results));
     let done = call.service.work.run(move |pool| inner.process(received, &out, pool, &stop)).await;
+    call.busy.send_modify(|tiles| *tiles -= 1);
     match done.flatten() {
         Ok(()) => true,
         Err(refusal) => {

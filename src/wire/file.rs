@@ -308,3 +308,23 @@ impl std::fmt::Debug for TileWriter {
         f.debug_struct("TileWriter").field("path", &self.path).finish_non_exhaustive()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_window_is_what_the_frame_says() {
+        let window = |head: &[u8]| window_bytes(&[&ZSTD_MAGIC, head].concat());
+        // A window descriptor: exponent 11, mantissa 0 and 4.
+        assert_eq!((window(&[0x00, 0x58]), window(&[0x04, 0x5c])), (2 << 20, 3 << 20));
+        // Single segments: sizes of 1, 2 (less 256) and 4 bytes, the last behind a dictionary's number of 1 byte.
+        assert_eq!((window(&[0x20, 200]), window(&[0x60, 0, 1])), (200, 512));
+        assert_eq!(window(&[0xa1, 9, 0, 0, 1, 0]), 1 << 16);
+        // What is beyond the limit is refused when it is read.
+        assert_eq!((window(&[0x00, 0xff]), window(&[])), (1 << MAX_WINDOW_LOG, 1 << 10));
+        let mut encoder = zstd::Encoder::new(Vec::new(), 3).unwrap();
+        encoder.write_all(&[7; 1 << 22]).unwrap();
+        assert_eq!(window_bytes(&encoder.finish().unwrap()), 2 << 20);
+    }
+}

@@ -108,7 +108,7 @@ fn bad_usage_exits_with_2_and_says_what_would_be_right() {
 
 #[test]
 fn help_and_version_exit_with_0() {
-    for command in ["filter", "inspect", "post", "synth"] {
+    for command in ["demo", "filter", "inspect", "post", "synth"] {
         let output = rpfd([command, "--help"]);
         assert_eq!(output.status.code(), Some(0));
         let help = String::from_utf8(output.stdout).unwrap();
@@ -116,4 +116,20 @@ fn help_and_version_exit_with_0() {
     }
     assert!(String::from_utf8(rpfd(["filter", "--help"]).stdout).unwrap().contains("paper-fast"));
     assert_eq!(rpfd(["--version"]).stdout, format!("rpfd {}\n", env!("CARGO_PKG_VERSION")).into_bytes());
+}
+
+#[test]
+fn an_interrupt_leaves_nothing_behind() {
+    let folder = Folder::new();
+    let args = ["synth", "--size", "4000x4000", "--spp", "16", "--json", "-o"];
+    let mut child = Command::new(env!("CARGO_BIN_EXE_rpfd"));
+    let child = child.args(args).arg(folder.path("out.tiles")).stderr(std::process::Stdio::piped()).spawn().unwrap();
+    while folder.names().is_empty() {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    assert!(stderr(&output).contains("interrupted"));
+    assert_eq!(folder.names(), [""; 0]);
 }

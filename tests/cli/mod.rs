@@ -1,5 +1,6 @@
 //! The `rpfd` command, run as users run it.
 
+mod demo;
 mod failures;
 mod filter;
 mod inspect;

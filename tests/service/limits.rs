@@ -15,10 +15,10 @@ use std::{
 const IMAGE: [u32; 2] = [64, 64];
 
 /// Memory that this tile needs, as an argument, with room for rounding.
-fn memory(side: u32, preset: &str) -> String {
+fn memory(side: u32, method: &Method) -> String {
     let tile = samples(IMAGE, Rect::new(0, 0, side, side), 0, 1);
     let header = Header::of(&tile, Format::F32).unwrap();
-    (plan(&header.shape(), &Method::preset(preset).unwrap()).total(2) + 1024).to_string()
+    (plan(&header.shape(), method).total(2) + 1024).to_string()
 }
 
 #[test]
@@ -44,7 +44,7 @@ fn varying_counts_are_admitted_by_their_upper_bound() {
 
 #[test]
 fn a_full_budget_is_503_until_it_is_free_again() {
-    let server = Server::start(&["--memory", &memory(48, "lean"), "--queue-deadline", "0.3"]);
+    let server = Server::start(&["--memory", &memory(48, &Method::default()), "--queue-deadline", "0.3"]);
     let body = tile(IMAGE, Rect::new(0, 0, 48, 48), 0);
     // This client sends half of a tile and then nothing.
     let mut slow = server.connect();
@@ -64,11 +64,15 @@ fn a_full_budget_is_503_until_it_is_free_again() {
 
 #[test]
 fn a_client_that_disappears_stops_its_work_and_frees_its_memory() {
-    let server = Server::start(&["--memory", &memory(48, "paper"), "--queue-deadline", "5"]);
+    // Half a minute of work on two threads.
+    let slow = [("boxes", "55,55,55,55"), ("fractions", "4,4,4,4")];
+    let method = Method::with("paper", slow).unwrap();
+    let server = Server::start(&["--memory", &memory(48, &method), "--queue-deadline", "5"]);
     let body = tile(IMAGE, Rect::new(0, 0, 48, 48), 0);
+    let path = "/v1/filter?preset=paper&boxes=55,55,55,55&fractions=4,4,4,4";
     for accept in ["Accept: application/msgpack", "Accept: image/x-exr"] {
         let mut gone = server.connect();
-        gone.write_all(head("POST", "/v1/filter?preset=paper", &[accept], body.len()).as_bytes()).unwrap();
+        gone.write_all(head("POST", path, &[accept], body.len()).as_bytes()).unwrap();
         gone.write_all(&body).unwrap();
         std::thread::sleep(Duration::from_millis(300));
         drop(gone);
@@ -122,6 +126,17 @@ fn a_client_that_only_sends_gets_its_refusal() {
         stream.write_all(&body).expect("the service takes what it has refused");
         Answer::read(&mut stream).problem(status, code);
     }
+}
+
+#[test]
+fn a_stream_waits_for_its_own_tiles_whatever_the_deadline() {
+    // Room for one tile, a deadline that filtering it takes longer than.
+    let server =
+        Server::start(&["--memory", &memory(48, &Method::preset("paper-fast").unwrap()), "--queue-deadline", "0.001"]);
+    let image = [144, 48];
+    let tiles: Vec<u8> = (0..3).flat_map(|i| tile(image, Rect::new(48 * i, 0, 48, 48), 0)).collect();
+    let messages = server.post("/v1/filter?preset=paper-fast", &tiles).messages();
+    assert_eq!(messages.last(), Some(&Message::End { tiles: 3, errors: 0 }), "{messages:?}");
 }
 
 #[test]
