@@ -1,13 +1,18 @@
 //! Tiles over HTTP give the image that filtering it whole gives, byte for byte.
 
 use super::{Server, encode, samples, tile};
-use crate::stitch::shuffle;
+use crate::{
+    cli::{rpfd, stderr},
+    stitch::shuffle,
+};
 use rpfd::{
-    filter::{Execution, Method, Rect, filter, geometry::tiling},
+    filter::{Execution, Method, Rect, TileGeometry, filter, geometry::tiling},
     stitch::{
         ExrOptions, RgbImage,
         exr::{self, provenance},
     },
+    store::Spool,
+    wire::{Format, Header, encode_tile, file::TileFile},
 };
 
 const SIDE: u32 = 48;
@@ -51,4 +56,40 @@ fn shuffled_tiles_are_the_whole_image() {
     let whole = encode(&samples(IMAGE, Rect::new(0, 0, SIDE, SIDE), 0, 1));
     let single = server.call("POST", "/v1/filter?preset=lean&seed=5", &["Accept: image/x-exr"], &whole);
     assert!(single.body == expected, "the single tile differs from the whole image");
+}
+
+/// The demo's render in tiles of 64 with the preset's full halo, shuffled, over HTTP, against the whole file offline.
+#[test]
+fn a_real_render_over_http_is_the_offline_file() {
+    let render = crate::cli::data("depth_of_field.8spp.tiles.zst");
+    let folder = crate::cli::Folder::new();
+    let (mut file, mut spool) = (TileFile::open(&render).unwrap(), Spool::in_memory(1 << 26));
+    while let Some(event) = file.next_event().unwrap() {
+        spool.push(&event).unwrap();
+    }
+    for preset in ["lean", "paper-fast"] {
+        let reach = Method::preset(preset).unwrap().reach(false);
+        let mut cores: Vec<Rect> = tiling([96, 144], 64).collect();
+        shuffle(&mut cores, 3);
+        let mut stream = Vec::new();
+        for core in cores {
+            let tile = spool.cut(TileGeometry::with_halo([96, 144], core, reach).unwrap()).unwrap();
+            encode_tile(&Header::of(&tile, Format::F32).unwrap(), &tile, &mut stream).unwrap();
+        }
+        let mut files = Vec::new();
+        for threads in ["1", "2"] {
+            let out = folder.path(&format!("{preset}-{threads}.exr"));
+            let output =
+                rpfd(["filter", render.to_str().unwrap(), "-o", &out, "--preset", preset, "--threads", threads]);
+            assert!(output.status.success(), "{}", stderr(&output));
+            files.push(std::fs::read(&out).unwrap());
+            let server = Server::start(&["--threads", threads]);
+            let open = format!(r#"{{"width": 96, "height": 144, "id": "a", "preset": "{preset}"}}"#);
+            assert_eq!(server.post("/v1/images", open.as_bytes()).status, 201);
+            let lines = server.post("/v1/images/a/tiles", &stream).lines();
+            assert!(lines.iter().filter(|line| line["state"] == "filtered").count() == 6, "{lines:?}");
+            files.push(server.get("/v1/images/a/result.exr").body);
+        }
+        assert!(files.iter().all(|file| *file == files[0]), "{preset}: the four files differ");
+    }
 }

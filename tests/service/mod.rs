@@ -32,7 +32,7 @@ impl Server {
     pub(crate) fn start(arguments: &[&str]) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let mut child = Command::new(env!("CARGO_BIN_EXE_rpfd"))
-            .args(["serve", "--listen", "127.0.0.1:0", "--threads", "2", "--data-dir"])
+            .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
             .arg(folder.path())
             .args(arguments)
             .env("RUST_LOG", "warn")
