@@ -15,10 +15,11 @@ use super::{Shared, body, images, problem::Refusal, stream};
 
 pub(super) fn router(service: Shared) -> Router {
     Router::new()
-        .route("/v1/filter", post(stream::filter_stream))
+        // PUT as well: `curl -T` sends nothing else.
+        .route("/v1/filter", post(stream::filter_stream).put(stream::filter_stream))
         .route("/v1/images", post(images::open).get(images::list))
         .route("/v1/images/{id}", get(images::status).delete(images::delete))
-        .route("/v1/images/{id}/tiles", post(stream::image_tiles))
+        .route("/v1/images/{id}/tiles", post(stream::image_tiles).put(stream::image_tiles))
         .route("/v1/images/{id}/result.exr", get(images::result))
         .route("/v1/images/{id}/preview.png", get(images::preview))
         .route("/livez", get(|| async { "alive\n" }))

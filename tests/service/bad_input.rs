@@ -150,7 +150,7 @@ fn requests_that_are_not_understood_have_a_code_and_a_status() {
     server.call("DELETE", "/v1/images/nobody", &[], &[]).problem(404, "unknown_image");
     let answer = server.get("/v1/filter");
     answer.problem(405, "method_not_allowed");
-    assert_eq!(answer.header("allow"), Some("POST"));
+    assert!(answer.header("allow").unwrap().contains("POST"));
     server.call("PUT", "/v1/images/a", &[], &[]).problem(405, "method_not_allowed");
 }
 

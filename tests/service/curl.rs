@@ -36,7 +36,7 @@ fn curl_does_it_all() {
     let (file, data) = (at("one.tiles"), format!("@{}", at("one.tiles")));
 
     // Streamed, at once, and asked to wait for the service's word.
-    let Some((status, streamed)) = curl(&["-T", &file, "-X", "POST", &url("/v1/filter")]) else { return };
+    let Some((status, streamed)) = curl(&["-T", &file, &url("/v1/filter")]) else { return };
     assert_eq!(status, 200);
     let messages = {
         let (mut decoder, mut input, mut count) = (ResultDecoder::new(), &streamed[..], 0);
@@ -46,7 +46,7 @@ fn curl_does_it_all() {
         count
     };
     assert_eq!(messages, 2);
-    let expect = ["-H", "Expect: 100-continue", "-T", &file, "-X", "POST"];
+    let expect = ["-H", "Expect: 100-continue", "-T", &file];
     assert_eq!(curl(&[&expect[..], &[&url("/v1/filter")]].concat()).unwrap().0, 200);
     assert_eq!(curl(&["--data-binary", &data, &url("/v1/filter?preset=unfiltered&seed=2")]).unwrap().0, 200);
     // Chunked, from a pipe.
@@ -78,6 +78,8 @@ fn curl_does_it_all() {
         let lines = String::from_utf8(curl(&sent).unwrap().1).unwrap();
         assert_eq!(lines.matches(r#""state":"repeated""#).count(), 2, "{lines}");
     }
+    let (status, lines) = curl(&["-T", &at("one.tiles"), &url("/v1/images/shot/tiles")]).unwrap();
+    assert!(status == 200 && String::from_utf8(lines).unwrap().contains("repeated"));
     let (status, image) = curl(&[&url("/v1/images/shot")]).unwrap();
     let image: serde_json::Value = serde_json::from_slice(&image).unwrap();
     assert_eq!((status, &image["complete"]), (200, &serde_json::json!(true)));
