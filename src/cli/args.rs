@@ -27,7 +27,7 @@ pub(crate) struct MethodArgs {
 
 static PRESET_HELP: LazyLock<String> = LazyLock::new(|| {
     let presets = PRESETS.iter().map(|(name, what)| format!("\n- {name}: {what}"));
-    format!("Preset to start from:{}\n", presets.collect::<String>())
+    format!("Preset to start from:{}", presets.collect::<String>())
 });
 
 static SET_HELP: LazyLock<String> = LazyLock::new(|| {
@@ -35,7 +35,7 @@ static SET_HELP: LazyLock<String> = LazyLock::new(|| {
     let parameters = parameters.iter().map(|(name, value)| format!("\n- {name} ({value})"));
     format!(
         "Set one of the preset's parameters; may be given several times, lists with commas (--set boxes=17,7). Every \
-         preset but unfiltered has, with the default preset's values:{}\n",
+         preset but unfiltered has, with the default preset's values:{}",
         parameters.collect::<String>()
     )
 });

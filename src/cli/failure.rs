@@ -99,7 +99,7 @@ impl From<SpoolError> for Failure {
 
 impl From<Stopped> for Failure {
     fn from(_: Stopped) -> Self {
-        Self::failed("interrupted", "interrupted; nothing was written")
+        Self::failed("interrupted", "interrupted")
     }
 }
 

@@ -314,7 +314,11 @@ fn print_summary(args: &Args, run: &Run, seconds: f64) {
     if let Some(png) = &args.png {
         println!("{}: to look at", png.display());
     }
-    println!("energy {:.4} of the input's, {} spikes taken out", totals.energy_out / totals.energy_in, totals.spikes);
+    println!(
+        "energy {:.4} of the input's, {} colour values were spikes",
+        totals.energy_out / totals.energy_in,
+        totals.spikes
+    );
     if totals.replaced.total() > 0 {
         println!("{} values were not finite and were replaced", totals.replaced.total());
     }

@@ -34,7 +34,10 @@ Exit codes: 0 done, 1 failed, 2 bad usage, 3 bad input, 4 the service refused.
 Examples:
   rpfd demo                                       see it work, on a real render
   rpfd inspect render.tiles.zst                   what is in a file, and what is wrong with it
-  rpfd filter render.tiles.zst -o render.exr      denoise a file";
+  rpfd filter render.tiles.zst -o render.exr      denoise a file
+  rpfd serve --listen 0.0.0.0:8080                run the service
+  rpfd post render.tiles.zst --to http://HOST:8080 -o render.exr
+                                                  denoise a file by the service";
 
 #[derive(clap::Subcommand)]
 enum Command {

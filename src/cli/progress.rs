@@ -5,6 +5,7 @@ use std::sync::{
     Arc,
     atomic::{AtomicBool, Ordering},
 };
+use tokio::signal::unix::{SignalKind, signal};
 
 /// A bar on standard error that counts to `total`; it draws nothing unless that is a terminal.
 pub(crate) fn bar(what: &'static str, total: u64) -> ProgressBar {
@@ -27,15 +28,17 @@ pub(crate) fn interrupted() -> Arc<AtomicBool> {
     let set = flag.clone();
     // Where signals cannot be caught they end the program as ever.
     let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_all().build() else { return flag };
+    let caught = {
+        // From here on, not from whenever the thread gets to run.
+        let _context = runtime.enter();
+        (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
+    };
+    let (Ok(mut interrupt), Ok(mut terminate)) = caught else { return flag };
     std::thread::spawn(move || {
         runtime.block_on(async {
-            use tokio::signal::unix::{SignalKind, signal};
-            let (Ok(mut int), Ok(mut term)) = (signal(SignalKind::interrupt()), signal(SignalKind::terminate())) else {
-                return;
-            };
-            tokio::select! { _ = int.recv() => {} _ = term.recv() => {} }
+            tokio::select! { _ = interrupt.recv() => {} _ = terminate.recv() => {} }
             set.store(true, Ordering::Relaxed);
-            tokio::select! { _ = int.recv() => {} _ = term.recv() => {} }
+            tokio::select! { _ = interrupt.recv() => {} _ = terminate.recv() => {} }
             std::process::exit(130);
         });
     });

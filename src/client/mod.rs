@@ -115,15 +115,17 @@ impl Client {
             return Err(ClientError::Url(base.to_owned()));
         }
         // Filtering a tile may take long, and so may waiting for the service's memory; silence between bytes may not.
-        let agent = Agent::config_builder()
+        let config = Agent::config_builder()
             .http_status_as_error(false)
             .user_agent(concat!("rpfd/", env!("CARGO_PKG_VERSION")))
             .timeout_connect(Some(Duration::from_secs(10)))
             .timeout_send_body(Some(Duration::from_secs(600)))
             .timeout_recv_response(Some(Duration::from_secs(1800)))
-            .timeout_recv_body(Some(Duration::from_secs(3600)))
-            .build()
-            .new_agent();
+            .timeout_recv_body(Some(Duration::from_secs(3600)));
+        // A proxy of the environment's cannot reach what is on this machine.
+        let local = ["://127.", "://localhost", "://[::1]"].iter().any(|host| base.contains(host));
+        let config = if local { config.proxy(None) } else { config };
+        let agent = config.build().new_agent();
         let base = base.trim_end_matches('/').to_owned();
         Ok(Self { agent, base, retry: Retry { attempts: attempts.max(1), stop } })
     }
