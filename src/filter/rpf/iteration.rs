@@ -9,7 +9,7 @@ use super::statistics::{Span, impute, normalise, pad, span};
 use super::weights::{Dependencies, Weights, steepness};
 use super::{grid::Grid, random, spikes};
 use crate::filter::lanes::{Simd, padded};
-use crate::filter::{Plane, Rect, SampleTile};
+use crate::filter::{Execution, Plane, Rect, SampleTile};
 
 /// All that a pass reads.
 pub(crate) struct Pass<'a> {
@@ -18,7 +18,7 @@ pub(crate) struct Pass<'a> {
     pub(crate) params: &'a Params,
     /// Which iteration, from 0.
     pub(crate) t: usize,
-    pub(crate) seed: u64,
+    pub(crate) execution: &'a Execution<'a>,
     /// Offsets of this iteration's box.
     pub(crate) offsets: Offsets,
     /// n ln n.
@@ -102,7 +102,7 @@ impl Pass<'_> {
             feature: self.params.feature_threshold,
             floor: self.params.threshold_floor,
         };
-        let key = random::pixel_key(self.seed, x, y, self.t);
+        let key = random::pixel_key(self.execution.seed, x, y, self.t);
         let center = Center { x, y, key, wanted: self.params.neighbors(self.t, own) };
         gather_rows(&mut scratch.rows, self.tile, self.relevant, &self.offsets, &clustering, &center);
         true
@@ -292,24 +292,21 @@ impl Pass<'_> {
         );
     }
 
-    /// Filters the pixels of `band`, rows of the data window from its left edge to its right, that lie in `region`.
-    /// `out` holds the colours of all of the band's samples.
+    /// Filters the pixels of `band`. `out` holds the colours of its rows, from the data window's left edge to its right.
     #[inline(always)]
     pub(crate) fn band<S: Simd>(
         &self,
         simd: S,
         scratch: &mut Scratch,
         grid: Option<&Grid>,
-        region: &Rect,
         band: &Rect,
         out: &mut [f32],
-        stopped: &dyn Fn() -> bool,
     ) {
         let window = self.tile.geometry().window();
-        let start = self.tile.samples_of(window.index(band.x, band.y)).start;
+        let start = self.tile.samples_of(window.index(window.x, band.y)).start;
         // Column by column, so that what one neighbourhood has brought into the cache serves the next.
-        for x in region.x..region.right() {
-            if stopped() {
+        for x in band.x..band.right() {
+            if self.execution.stopped() {
                 return;
             }
             for y in band.y..band.bottom() {

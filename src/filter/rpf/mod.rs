@@ -81,17 +81,8 @@ pub(super) fn filter(tile: &SampleTile, params: &Params, execution: &Execution) 
     for t in 0..iterations {
         let region = region(tile.geometry(), params, tile.varying(), t);
         let offsets = neighborhood::Offsets::new(params.boxes[t]);
-        let pass = Pass {
-            tile,
-            relevant: &relevant,
-            params,
-            t,
-            seed: execution.seed,
-            offsets,
-            terms: &terms,
-            colors: &colors,
-        };
-        run(&pass, &region, &mut scratches, &mut next, execution);
+        let pass = Pass { tile, relevant: &relevant, params, t, execution, offsets, terms: &terms, colors: &colors };
+        run(&pass, &region, &mut scratches, &mut next);
         if execution.stopped() {
             return Err(Stopped);
         }
@@ -127,34 +118,32 @@ fn interleaved_colors(tile: &SampleTile) -> Vec<f32> {
 }
 
 /// One iteration over a region, from `pass.colors` to `next`.
-fn run(pass: &Pass, region: &Rect, scratches: &mut [Scratch], next: &mut [f32], execution: &Execution) {
+fn run(pass: &Pass, region: &Rect, scratches: &mut [Scratch], next: &mut [f32]) {
+    let execution = pass.execution;
     let level = execution.simd.level();
     let window = pass.tile.geometry().window();
     let spacing = pass.params.information_grid;
-    let stopped = || execution.stopped();
     let grid = (spacing > 1).then(|| {
         let image = pass.tile.geometry().image();
         let mut grid = Grid::new(spacing, image, region, pass.relevant.features().len());
         let (rows, nodes) = grid.rows();
         share_out(execution, scratches, nodes, |scratch, (row, nodes)| {
-            if !stopped() {
+            if !execution.stopped() {
                 dispatch!(level, simd => rows.weigh(simd, pass, scratch, row, nodes));
             }
         });
         grid
     });
-    let bands = (region.y..region.bottom()).step_by(BAND as usize).scan(next, |rest, y| {
-        let band = Rect::new(window.x, y, window.width, BAND.min(region.bottom() - y));
-        let first = pass.tile.samples_of(window.index(band.x, band.y)).start;
-        let end = pass.tile.samples_of(window.index(band.right() - 1, band.bottom() - 1)).end;
-        // `rest` starts with the region's first band, later with the one after the last.
-        let skip = if y == region.y { 3 * first } else { 0 };
-        let (out, after) = std::mem::take(rest)[skip..].split_at_mut(3 * (end - first));
-        *rest = after;
+    let bands = (region.y..region.bottom()).step_by(BAND as usize).scan((next, 0), |(rest, done), y| {
+        let band = Rect::new(region.x, y, region.width, BAND.min(region.bottom() - y));
+        let first = 3 * pass.tile.samples_of(window.index(window.x, band.y)).start;
+        let end = 3 * pass.tile.samples_of(window.index(window.right() - 1, band.bottom() - 1)).end;
+        let (out, after) = std::mem::take(rest)[first - *done..].split_at_mut(end - first);
+        (*rest, *done) = (after, end);
         Some((band, out))
     });
     share_out(execution, scratches, bands, |scratch, (band, out)| {
-        dispatch!(level, simd => pass.band(simd, scratch, grid.as_ref(), region, &band, out, &stopped));
+        dispatch!(level, simd => pass.band(simd, scratch, grid.as_ref(), &band, out));
     });
 }
 

@@ -9,7 +9,7 @@ use crate::filter::rpf::iteration::{ColumnOrder, Pass, Scratch};
 use crate::filter::rpf::neighborhood::{Center, Offsets, candidate, pick_sample};
 use crate::filter::rpf::relevance::{Relevant, Source};
 use crate::filter::rpf::{Params, information, interleaved_colors, most_rows, random, spikes};
-use crate::filter::{Role, SampleTile};
+use crate::filter::{Execution, Role, SampleTile};
 
 /// Within this of a threshold, a decision may fall either way.
 const NEAR: f64 = 1e-5;
@@ -57,7 +57,17 @@ fn at_pixels(params: &Params, tile: &SampleTile, mut compare: impl FnMut(&Pass, 
     let mut scratch = Scratch::new(&relevant, rows, params.bins);
     for t in 0..params.boxes.len() {
         let offsets = Offsets::new(params.boxes[t]);
-        let pass = Pass { tile, relevant: &relevant, params, t, seed: 3, offsets, terms: &terms, colors: &colors };
+        let execution = Execution { seed: 3, ..Execution::default() };
+        let pass = Pass {
+            tile,
+            relevant: &relevant,
+            params,
+            t,
+            execution: &execution,
+            offsets,
+            terms: &terms,
+            colors: &colors,
+        };
         let window = tile.geometry().window();
         for y in (0..window.height).step_by(5) {
             for x in (0..window.width).step_by(7) {
@@ -128,7 +138,7 @@ fn neighbourhoods_accept_the_same_candidates() {
             let window = tile.geometry().window();
             let own = tile.samples_of(window.index(x, y));
             let mut fast = scratch.rows.samples[own.len()..].iter().copied().peekable();
-            let key = random::pixel_key(pass.seed, x, y, pass.t);
+            let key = random::pixel_key(pass.execution.seed, x, y, pass.t);
             let center = Center { x, y, key, wanted: params.neighbors(pass.t, own.len()) };
             for draw in 0..(center.wanted - own.len()) as u64 {
                 let Some((pixel, bits)) = candidate(&window, &window, &pass.offsets, &center, draw) else { continue };
@@ -365,7 +375,7 @@ fn whole_images_agree() {
     for settings in [[("information_grid", "1"), ("spikes", "on")], [("information_grid", "4"), ("spikes", "off")]] {
         let method = method("lean", &settings);
         let Algorithm::Rpf(params) = method.algorithm() else { unreachable!("lean is RPF") };
-        let execution = crate::filter::Execution { seed: 9, ..Default::default() };
+        let execution = Execution { seed: 9, ..Execution::default() };
         let fast = crate::filter::filter(&tile, &method, &execution).unwrap().rgb;
         let expected = oracle_image(&tile, params, 9);
         let mut far = 0;
