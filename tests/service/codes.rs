@@ -38,11 +38,8 @@ fn literal(source: &str) -> Option<String> {
 }
 
 /// Codes behind every occurrence of a text in a source.
-fn behind<'a>(source: &'a str, text: &'a str) -> impl Iterator<Item = (&'a str, String)> {
-    source.match_indices(text).filter_map(move |(at, _)| {
-        let rest = &source[at + text.len()..];
-        Some((rest, literal(rest)?))
-    })
+fn behind<'a>(source: &'a str, text: &'a str) -> impl Iterator<Item = String> {
+    source.match_indices(text).filter_map(move |(at, _)| literal(&source[at + text.len()..]))
 }
 
 /// Reads the sources, where each code is written out beside its status or in a `code()` of an error.
@@ -71,26 +68,23 @@ fn the_table_is_what_the_sources_say() {
             ("SERVICE_UNAVAILABLE", 503),
             ("INSUFFICIENT_STORAGE", 507),
         ] {
-            codes.extend(behind(source, &format!("StatusCode::{name},")).map(|(_, code)| (code, Some(status))));
+            codes.extend(behind(source, &format!("StatusCode::{name},")).map(|code| (code, Some(status))));
         }
-        for status in 400..600 {
-            codes.extend(behind(source, &format!("new({status},")).map(|(_, code)| (code, Some(status))));
-            codes.extend(
-                behind(source, &format!("new(\n                {status},")).map(|(_, code)| (code, Some(status))),
-            );
+        // `Problem::new(404, "code", ...)`, on one line or several.
+        for (at, new) in source.match_indices("new(") {
+            let Some((status, rest)) = source[at + new.len()..].split_once(',') else { continue };
+            if let (Ok(status), Some(code)) = (status.trim().parse(), literal(rest)) {
+                codes.insert(code, Some(status));
+            }
         }
-        for short in ["refuse(", "bad(", "=> \""] {
-            let start = short.strip_suffix('"').unwrap_or(short);
-            codes.extend(behind(source, start).map(|(_, code)| (code, None)).filter(|(code, _)| {
-                // Words that are matched, not sent.
-                !["zip", "float"].contains(&code.as_str())
-            }));
+        for short in ["refuse(", "bad("] {
+            behind(source, short).for_each(|code| drop(codes.entry(code).or_insert(None)));
         }
     }
-    for file in ["src/wire/error.rs", "src/admission/mod.rs", "src/stitch/mod.rs"] {
+    for file in ["src/wire/error.rs", "src/admission/mod.rs", "src/stitch/mod.rs", "src/service/problem.rs"] {
         let source = read(file);
         let source = source.split("#[cfg(test)]").next().unwrap();
-        codes.extend(behind(source, "=> ").map(|(_, code)| (code, None)));
+        behind(source, "=> ").for_each(|code| drop(codes.entry(code).or_insert(None)));
     }
     // The stitcher's own name for what the service calls `bad_geometry`.
     assert!(codes.remove("invalid_geometry").is_some());
@@ -107,7 +101,8 @@ fn the_codes_of_the_format_are_codes_of_the_service() {
     let text = read("proto/tile.md");
     let table = text.split("## Codes").nth(1).unwrap();
     let words = table.lines().filter_map(|line| line.strip_prefix("| `")?.split('|').next());
-    let codes: Vec<_> = words.flat_map(|cell| cell.split('`')).filter(|w| literal(&format!("\"{w}\"")).is_some()).collect();
+    let codes: Vec<_> =
+        words.flat_map(|cell| cell.split('`')).filter(|w| literal(&format!("\"{w}\"")).is_some()).collect();
     assert_eq!(codes.len(), 17, "{codes:?}");
     for code in codes {
         assert!(DOCUMENTED.contains_key(code), "{code}");
