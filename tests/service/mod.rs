@@ -1,6 +1,7 @@
 //! The service over HTTP: the real binary on a free port.
 
 mod bad_input;
+mod clients;
 mod codes;
 mod curl;
 mod exact;
