@@ -49,8 +49,8 @@ impl Channel {
         Self { name: name.into(), role, components }
     }
 
-    /// Whether a sample whose components are all 0 has no such feature, as the papers encode it: world positions, and
-    /// the normals that everyone calls `N` and `N2`, since no normal is 0. (An albedo of 0 is black.)
+    /// Whether a sample whose components are all 0 (or NaN) has no such feature, as the papers encode it: world
+    /// positions, and the normals that everyone calls `N` and `N2`, since no normal is 0. (An albedo of 0 is black.)
     pub fn zero_is_missing(&self) -> bool {
         match self.role {
             Role::Feature { position } => position || matches!(self.name.as_str(), "N" | "N2"),
@@ -182,6 +182,18 @@ pub enum Plane {
     Constant(f32),
     /// One value per sample.
     Values(Vec<f32>),
+}
+
+impl Plane {
+    /// Keeps one value of a plane whose values are all equal.
+    fn collapse(&mut self) {
+        if let Self::Values(values) = self {
+            let first = values.first().copied().unwrap_or(0.0);
+            if values.iter().all(|&v| v == first || v.is_nan() && first.is_nan()) {
+                *self = Self::Constant(first);
+            }
+        }
+    }
 }
 
 /// Values that were not finite where they must be, and what they became.
@@ -371,6 +383,8 @@ impl SampleTile {
                 Role::Film => self.replaced.film += replaced,
             }
         }
+        // A plane is the same whether it was spelt out or not, also where only some of its zeros mean something.
+        self.planes.iter_mut().for_each(Plane::collapse);
         let mut first = 0;
         for channel in self.channels.channels() {
             let components = channel.components as usize;
@@ -379,14 +393,7 @@ impl SampleTile {
             }
             first += components;
         }
-        for plane in &mut self.planes {
-            if let Plane::Values(values) = plane {
-                let first = values.first().copied().unwrap_or(0.0);
-                if values.iter().all(|&v| v == first || v.is_nan() && first.is_nan()) {
-                    *plane = Plane::Constant(first);
-                }
-            }
-        }
+        self.planes.iter_mut().for_each(Plane::collapse);
     }
 
     /// Where the tile lies.
@@ -442,18 +449,20 @@ impl SampleTile {
     }
 }
 
-/// Sets samples whose components are all 0 to missing. A component that is 0 throughout may stay so: the others say it.
+/// Sets samples whose components are all 0 (or missing already) to missing. A component that is 0 throughout may stay so:
+/// the others say it.
 fn zero_to_missing(components: &mut [Plane], samples: usize) {
-    if components.iter().all(|plane| *plane == Plane::Constant(0.0)) {
+    let zero = |value: f32| value == 0.0 || value.is_nan();
+    if components.iter().all(|plane| matches!(plane, Plane::Constant(value) if zero(*value))) {
         components.fill(Plane::Constant(f32::NAN));
         return;
     }
     for sample in 0..samples {
-        let zero = |plane: &Plane| match plane {
-            Plane::Constant(value) => *value == 0.0,
-            Plane::Values(values) => values[sample] == 0.0,
+        let value = |plane: &Plane| match plane {
+            Plane::Constant(value) => *value,
+            Plane::Values(values) => values[sample],
         };
-        if components.iter().all(zero) {
+        if components.iter().all(|plane| zero(value(plane))) {
             for plane in components.iter_mut() {
                 if let Plane::Values(values) = plane {
                     values[sample] = f32::NAN;
@@ -471,5 +480,80 @@ fn replace_by_mean(samples: &mut [f32]) {
         let sum: f64 = finite.map(|&v| f64::from(v)).sum();
         let mean = if count == 0 { 0.0 } else { (sum / count as f64) as f32 };
         samples.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = mean);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::filter::Rect;
+
+    /// Two pixels of two samples; one feature of three components.
+    fn feature(name: &str, position: bool, components: [Plane; 3]) -> SampleTile {
+        let channels = vec![Channel::new("color", Role::Color, 3), Channel::new(name, Role::Feature { position }, 3)];
+        let geometry = TileGeometry::with_halo([2, 1], Rect::new(0, 0, 2, 1), 0).unwrap();
+        let planes = [Plane::Constant(0.0), Plane::Constant(0.0), Plane::Constant(0.0)].into_iter().chain(components);
+        SampleTile::new(geometry, ChannelSet::new(channels).unwrap(), Counts::Uniform(2), planes.collect()).unwrap()
+    }
+
+    /// What became of the feature, missing values as 9.
+    fn read(tile: &SampleTile) -> [[f32; 4]; 3] {
+        let value = |plane, sample| Some(tile.value(plane, sample)).filter(|v| !v.is_nan()).unwrap_or(9.0);
+        [3, 4, 5].map(|plane| [0, 1, 2, 3].map(|sample| value(plane, sample)))
+    }
+
+    const NAMES: [(&str, bool, bool); 6] = [
+        ("P", true, true),
+        ("anything", true, true),
+        ("N", false, true),
+        ("N2", false, true),
+        ("albedo", false, false),
+        ("N3", false, false),
+    ];
+
+    #[test]
+    fn constant_zeros_are_missing_where_no_feature_is_zero() {
+        let values = || Plane::Values(vec![0.0, -0.0, 0.0, 0.0]);
+        for (name, position, missing) in NAMES {
+            for planes in [[0.0; 3].map(Plane::Constant), [values(), values(), values()], {
+                [Plane::Constant(0.0), values(), Plane::Constant(-0.0)]
+            }] {
+                let tile = feature(name, position, planes);
+                for plane in 3..6 {
+                    let Plane::Constant(value) = tile.plane(plane) else { panic!("{name}: it is constant") };
+                    assert!(if missing { value.is_nan() } else { *value == 0.0 }, "{name}");
+                }
+                assert_eq!(tile.replaced().total(), 0);
+            }
+        }
+    }
+
+    #[test]
+    fn single_samples_of_zeros_are_missing_and_others_are_not() {
+        let planes = || {
+            let x = Plane::Values(vec![0.0, 0.0, 1.0, f32::NAN]);
+            [x, Plane::Values(vec![0.0, -2.0, 0.0, 0.0]), Plane::Values(vec![-0.0, 0.0, 3.0, 0.0])]
+        };
+        for (name, position, missing) in NAMES {
+            let expected = if missing {
+                [[9.0, 0.0, 1.0, 9.0], [9.0, -2.0, 0.0, 9.0], [9.0, 0.0, 3.0, 9.0]]
+            } else {
+                [[0.0, 0.0, 1.0, 9.0], [0.0, -2.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0]]
+            };
+            assert_eq!(read(&feature(name, position, planes())), expected, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_component_that_is_zero_throughout_stays_constant() {
+        let values = |values: [f32; 4]| Plane::Values(values.to_vec());
+        for zeros in [Plane::Constant(0.0), values([0.0; 4]), values([0.0, -0.0, 0.0, 0.0])] {
+            let tile = feature("N", false, [values([0.0, 1.0, 0.0, 0.5]), zeros, values([0.0, 0.0, 1.0, 0.5])]);
+            assert_eq!(read(&tile), [[9.0, 1.0, 0.0, 0.5], [0.0; 4], [9.0, 0.0, 1.0, 0.5]]);
+            assert_eq!(tile.plane(4), &Plane::Constant(0.0));
+        }
+        // One that is constant but not 0 makes a feature of every sample.
+        let tile = feature("P", true, [values([0.0, 1.0, 0.0, 0.0]), Plane::Constant(0.0), Plane::Constant(5.0)]);
+        assert_eq!(read(&tile), [[0.0, 1.0, 0.0, 0.0], [0.0; 4], [5.0; 4]]);
     }
 }

@@ -6,7 +6,8 @@ use crate::filter::{Role, SampleTile};
 /// The digest of a core's samples: where the core lies, the channels, the sample counts, and every value, by rows.
 ///
 /// It does not depend on the halo, nor on whether a plane was sent as one constant; what was not finite counts as what it
-/// was replaced by, and all missing features (NaN) are equal. Takes one pass over the core's samples and 64 KiB.
+/// was replaced by, and all missing features (NaN) are equal, with the component that stayed 0 because it is 0 all over the
+/// data window or without it. Takes one pass over the core's samples and 64 KiB.
 pub fn digest(tile: &SampleTile) -> Digest {
     let (image, core, window) = (tile.geometry().image(), tile.geometry().core(), tile.geometry().window());
     let mut out = Hasher { hash: blake3::Hasher::new(), bytes: Vec::with_capacity(1 << 16) };
@@ -27,14 +28,18 @@ pub fn digest(tile: &SampleTile) -> Digest {
             out.number(tile.samples_of(window.index(x, y)).len() as u32);
         }
     }
-    for plane in 0..tile.channels().planes() {
+    for (plane, (channel, component)) in tile.channels().plane_channels().enumerate() {
+        let first = plane - component as usize;
+        let siblings = if channel.zero_is_missing() { first..first + channel.components as usize } else { 0..0 };
         for y in core.y..core.bottom() {
             // The samples of a row of pixels are next to each other.
             let first = tile.samples_of(window.index(core.x, y)).start;
             let end = tile.samples_of(window.index(core.right() - 1, y)).end;
             for sample in first..end {
                 let value = tile.value(plane, sample);
-                out.number(if value.is_nan() { f32::NAN.to_bits() } else { value.to_bits() });
+                let zero = |value: f32| value == 0.0 || value.is_nan();
+                let none = zero(value) && !siblings.is_empty() && siblings.clone().all(|p| zero(tile.value(p, sample)));
+                out.number(if value.is_nan() || none { f32::NAN.to_bits() } else { value.to_bits() });
             }
         }
     }
@@ -86,6 +91,22 @@ mod tests {
         let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3), feature]).unwrap();
         let geometry = TileGeometry::with_halo([2, 1], Rect::new(0, 0, 2, 1), 0).unwrap();
         digest(&SampleTile::new(geometry, channels, counts, values.into()).unwrap())
+    }
+
+    /// A component that is 0 in all the core stays 0 in a tile of the core alone; with a halo where it is not, samples
+    /// without the feature have none of it.
+    #[test]
+    fn the_halo_does_not_count_where_zeros_mean_missing() {
+        let with_halo = |halo: u32| {
+            let geometry = TileGeometry::with_halo([3, 1], Rect::new(0, 0, 2, 1), halo).unwrap();
+            let channels =
+                [Channel::new("color", Role::Color, 3), Channel::new("N", Role::Feature { position: false }, 2)];
+            let cut = |values: [f32; 3]| Plane::Values(values[..2 + halo as usize].to_vec());
+            let planes = vec![cut([1.0; 3]), cut([1.0; 3]), cut([1.0; 3]), cut([0.0, 1.0, 1.0]), cut([0.0, 0.0, 1.0])];
+            let channels = ChannelSet::new(channels.into()).unwrap();
+            SampleTile::new(geometry, channels, Counts::Uniform(1), planes).unwrap()
+        };
+        assert_eq!(digest(&with_halo(0)), digest(&with_halo(1)));
     }
 
     #[test]

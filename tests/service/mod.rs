@@ -1,6 +1,8 @@
 //! The service over HTTP: the real binary on a free port.
 
 mod bad_input;
+mod clients;
+mod codes;
 mod curl;
 mod exact;
 mod images;
@@ -160,6 +162,7 @@ impl Answer {
         let problem = self.json();
         assert_eq!((problem["code"].as_str(), problem["status"].as_u64()), (Some(code), Some(status.into())), "{text}");
         assert!(!problem["detail"].as_str().unwrap().is_empty());
+        codes::check_documented(code, status);
         problem
     }
 }

@@ -12,7 +12,12 @@ use std::{
 
 /// Runs a script of `proto`, or says that the test is skipped where there is no Python with these modules; with
 /// `RPFD_CI` set that is a failure.
-fn python(modules: &str, script: &str, args: &[&Path]) -> Option<Output> {
+pub(crate) fn python(modules: &str, script: &str, args: &[&Path]) -> Option<Output> {
+    run_python(modules, &Path::new(env!("CARGO_MANIFEST_DIR")).join("proto").join(script), args)
+}
+
+/// The same for any script.
+pub(crate) fn run_python(modules: &str, script: &Path, args: &[&Path]) -> Option<Output> {
     let python =
         |args: &[&std::ffi::OsStr]| Command::new("python3").args(args).env("PYTHONDONTWRITEBYTECODE", "1").output();
     let there = python(&["-c".as_ref(), format!("import {modules}").as_ref()]).is_ok_and(|o| o.status.success());
@@ -21,14 +26,13 @@ fn python(modules: &str, script: &str, args: &[&Path]) -> Option<Output> {
         eprintln!("SKIPPED: there is no python3 with {modules}");
         return None;
     }
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("proto").join(script);
     let args: Vec<_> = std::iter::once(script.as_os_str()).chain(args.iter().map(|a| a.as_os_str())).collect();
     let output = python(&args).unwrap();
     eprintln!("{}", String::from_utf8_lossy(&output.stderr));
     Some(output)
 }
 
-const CLIENT: &str = "clients/python/rpfd_client.py";
+pub(crate) const CLIENT: &str = "clients/python/rpfd_client.py";
 
 #[test]
 fn the_vectors_are_what_their_maker_makes_and_fit_the_schema() {

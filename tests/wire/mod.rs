@@ -2,7 +2,7 @@
 
 mod codec;
 mod files;
-mod interop;
+pub(crate) mod interop;
 mod spool;
 mod vectors;
 

@@ -1,14 +1,19 @@
 #!/usr/bin/env python3
-"""A minimal client of tile.md: writes tiles, posts them, reads results. Needs NumPy and msgpack, nothing else.
+"""A minimal client of tile.md and http.md: writes tiles, sends them, reads results. Needs NumPy and msgpack only.
 
   rpfd_client.py post URL IN.tiles OUT.npy     filter the tiles of a file (URL: http://host:port/v1/filter?preset=NAME)
+  rpfd_client.py images URL IN.tiles OUT.exr   stitch them on the service (URL: http://host:port/v1/images?preset=NAME)
   rpfd_client.py image RESULTS.msgpack OUT.npy stitch results that are in a file
   rpfd_client.py info IN.tiles                 print every header, and each plane's sum
   rpfd_client.py example OUT.tiles             write a small noisy image in four haloed tiles
+
+Progress and problems go to standard error. Files compressed with zstd are sent as they are ("images" looks into them
+first, for which it needs zstandard).
 """
 import json
 import sys
 import urllib.error
+import urllib.parse
 import urllib.request
 
 import msgpack
@@ -28,7 +33,8 @@ def formats(header):
 def pack_tile(header, planes, counts=None):
     """A tile as bytes. `planes`: one array a component, of the samples of the data window, pixels row by row and the
     samples of a pixel next to each other, in any shape with that order; or one number for a constant plane. `counts`:
-    the samples of each pixel, if header["samples"] is "varying"."""
+    the samples of each pixel, if header["samples"] is "varying". NaN says that a sample has no such feature; in positions,
+    N and N2 so do zeros."""
     parts = [msgpack.packb(header)]
     if counts is not None:
         parts.append(msgpack.packb(np.asarray(counts, "<u2").tobytes()))
@@ -79,13 +85,56 @@ def stitch(results):
     return image, errors
 
 
-def post(url, body):
-    """Posts a tile stream (bytes, or an open file) and returns the answer to read results from."""
-    request = urllib.request.Request(url, body, {"Content-Type": "application/msgpack"}, method="POST")
+def call(method, url, body=None):
+    """Sends a request (bytes, or an open file, which is streamed) and returns the answer to read from."""
+    headers = {"Content-Type": "application/msgpack"}
+    if hasattr(body, "peek") and body.peek(4)[:4] == b"\x28\xb5\x2f\xfd":
+        headers["Content-Encoding"] = "zstd"
     try:
-        return urllib.request.urlopen(request)
+        return urllib.request.urlopen(urllib.request.Request(url, body, headers, method=method))
     except urllib.error.HTTPError as error:
         raise SystemExit(f"{error.code} {error.reason}: {error.read().decode(errors='replace')}") from None
+
+
+def post(url, body):
+    """Posts a tile stream (bytes, or an open file) and returns the answer to read results from."""
+    return call("POST", url, body)
+
+
+def progress(results):
+    """Passes results on, and says how far they are."""
+    done = total = 0
+    for message, planes in results:
+        if message["type"] == "result":
+            done, total = done + message["tile"][2] * message["tile"][3], message["image"][0] * message["image"][1]
+            print(f"{done} of {total} pixels", file=sys.stderr)
+        yield message, planes
+
+
+def stitch_there(url, path, out):
+    """Opens an image, sends it the tiles of a file, and fetches the EXR; the image is deleted. False if tiles failed."""
+    url, _, query = url.partition("?")
+    opener = open
+    if path.endswith(".zst"):
+        from zstandard import open as opener
+    with opener(path, "rb") as file:
+        width, height = next(read_tiles(file))[0]["image"]
+    body = {"width": width, "height": height, **dict(urllib.parse.parse_qsl(query, strict_parsing=bool(query)))}
+    image = json.load(call("POST", url, json.dumps(body).encode()))
+    image_url, end = f"{url}/{image['id']}", None
+    try:
+        with open(path, "rb") as file:
+            for line in call("POST", image_url + "/tiles", file):
+                end = json.loads(line)
+                print(line.decode().rstrip(), file=sys.stderr)
+        if end is None or end["state"] != "end":
+            raise EOFError("the answer was cut: it has no end")
+        if end["errors"] == 0:
+            with open(out, "wb") as file:
+                file.write(call("GET", image_url + "/result.exr").read())
+        return end["errors"] == 0
+    finally:
+        call("DELETE", image_url)
 
 
 def example(side=16, halo=4, samples=4):
@@ -109,7 +158,9 @@ def example(side=16, halo=4, samples=4):
 def main(command=None, *args):
     if command == "post" and len(args) == 3:
         with open(args[1], "rb") as file:
-            image, errors = stitch(read_results(post(args[0], file.read())))
+            image, errors = stitch(progress(read_results(post(args[0], file))))
+    elif command == "images" and len(args) == 3:
+        return None if stitch_there(*args) else 1
     elif command == "image" and len(args) == 2:
         with open(args[0], "rb") as file:
             image, errors = stitch(read_results(file))

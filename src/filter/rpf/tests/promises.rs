@@ -162,6 +162,56 @@ fn planes_without_effect_change_no_bit() {
     }
 }
 
+/// Samples that miss a feature, one of whose components is 0 all over a tile, but not all over the image.
+#[test]
+fn a_component_that_is_zero_in_a_tile_only_gives_the_whole_images_bits() {
+    let image = [48, 14];
+    let at = |x: u32, y: u32, sample: u32, k: u32| {
+        let mixed = (x * 73 + y * 1031 + sample * 7919 + k * 104_729).wrapping_mul(2_654_435_761);
+        (mixed >> 8) as f32 / (1 << 24) as f32
+    };
+    let cut = |core: Rect, halo: u32| {
+        let geometry = TileGeometry::with_halo(image, core, halo).unwrap();
+        let window = geometry.window();
+        let channels = ChannelSet::new(vec![
+            Channel::new("color", Role::Color, 3),
+            Channel::new("N", Role::Feature { position: false }, 3),
+            Channel::new("lens", Role::Random { uniform: true }, 1),
+        ]);
+        let mut planes = vec![Vec::new(); 7];
+        for y in window.y..window.bottom() {
+            for x in window.x..window.right() {
+                for sample in 0..4 {
+                    let missing = at(x, y, sample, 9) < 0.3;
+                    let z = if x < 40 { 0.0 } else { at(x, y, sample, 5) };
+                    let normal = [at(x, y, sample, 3), at(x, y, sample, 4), z];
+                    for (k, plane) in planes.iter_mut().enumerate() {
+                        plane.push(match k {
+                            3..6 if missing => 0.0,
+                            3..6 => normal[k - 3],
+                            _ => at(x, y, sample, k as u32),
+                        });
+                    }
+                }
+            }
+        }
+        let planes = planes.into_iter().map(Plane::Values).collect();
+        SampleTile::new(geometry, channels.unwrap(), Counts::Uniform(4), planes).unwrap()
+    };
+    let whole = cut(Rect::new(0, 0, 48, 14), 0);
+    for method in methods() {
+        let left = cut(Rect::new(0, 0, 12, 14), method.reach(false));
+        let constant = matches!(left.plane(5), Plane::Constant(_));
+        assert!(matches!(whole.plane(5), Plane::Values(_)) && (constant || method.reach(false) > 28));
+        let (whole, left) = (run(&whole, &method), run(&left, &method));
+        for (whole, left) in whole.rgb.iter().zip(&left.rgb) {
+            for y in 0..14 {
+                assert_eq!(bits(&whole[y * 48..y * 48 + 12]), bits(&left[y * 12..y * 12 + 12]), "row {y}");
+            }
+        }
+    }
+}
+
 /// The plainest tiles there are: no film, no features, no random parameters; one or no sample; one pixel.
 #[test]
 fn the_smallest_tiles_filter() {
