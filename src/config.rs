@@ -73,6 +73,8 @@ pub const MIN_MEMORY: u64 = 1 << 20;
 pub const MAX_MEMORY: u64 = (1 << 42) - 1024;
 /// Most threads.
 pub const MAX_THREADS: usize = 1024;
+/// Most pixels of an image: the greatest width and height there are.
+pub const MAX_IMAGE_PIXELS: u64 = 1 << 40;
 /// Longest deadline: a day.
 pub const MAX_DEADLINE: Duration = Duration::from_secs(86_400);
 
@@ -99,6 +101,8 @@ pub struct Config {
     pub connections: usize,
     /// Images open at once. 1 to 65536.
     pub images: usize,
+    /// Pixels of an image at most; its canvas takes 12 bytes of disk for each. 1 to [`MAX_IMAGE_PIXELS`].
+    pub image_pixels: u64,
 }
 
 impl Default for Config {
@@ -115,6 +119,7 @@ impl Default for Config {
             shutdown_deadline: Duration::from_secs(20),
             connections: 1024,
             images: 1024,
+            image_pixels: 1 << 30,
         }
     }
 }
@@ -149,6 +154,8 @@ impl Config {
         for (name, count) in [("connections", self.connections), ("images", self.images)] {
             rule((1..=65536).contains(&count), name, &count, "must be 1 to 65536");
         }
+        let pixels = (1..=MAX_IMAGE_PIXELS).contains(&self.image_pixels);
+        rule(pixels, "image_pixels", &self.image_pixels, "must be 1 to 2^40");
         if wrong.is_empty() { Ok(()) } else { Err(ConfigError(wrong)) }
     }
 }
@@ -197,9 +204,10 @@ mod tests {
             shutdown_deadline: Duration::ZERO,
             connections: 0,
             images: 0,
+            image_pixels: 0,
             ..Config::default()
         };
-        assert_eq!(zero.validate().unwrap_err().0.len(), 9);
+        assert_eq!(zero.validate().unwrap_err().0.len(), 10);
     }
 
     #[test]
@@ -215,6 +223,7 @@ mod tests {
         assert!(with(&|c| c.threads = MAX_THREADS) && !with(&|c| c.threads = MAX_THREADS + 1));
         assert!(with(&|c| c.idle_deadline = MAX_DEADLINE) && !with(&|c| c.idle_deadline = MAX_DEADLINE + second));
         assert!(with(&|c| c.connections = 65536) && !with(&|c| c.connections = 65537));
+        assert!(with(&|c| c.image_pixels = MAX_IMAGE_PIXELS) && !with(&|c| c.image_pixels = MAX_IMAGE_PIXELS + 1));
         assert!(with(&|c| c.images = 1) && !with(&|c| c.images = 65537));
     }
 }

@@ -3,7 +3,6 @@
 use std::{
     collections::{BTreeMap, HashMap},
     hash::{BuildHasher, RandomState},
-    path::Path,
     sync::{Arc, Mutex, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard},
 };
 
@@ -25,6 +24,7 @@ use super::{
     work::blocking,
 };
 use crate::{
+    config::Config,
     filter::{ChannelSet, Filtered, Method, Rect, SampleTile},
     stitch::{Added, Claim, Offer, StitchError, Stitcher, digest::digest},
     wire::{Problem, TileReport, message::ReplacedCounts},
@@ -285,7 +285,7 @@ impl Images {
 }
 
 /// What the JSON that opens an image says.
-fn described(body: &[u8], folder: &Path) -> Result<Image, Refusal> {
+fn described(body: &[u8], config: &Config) -> Result<Image, Refusal> {
     let mut parameters = Parameters::of_json(body)?;
     let mut side = |name: &str| {
         let side = parameters.number(name)?;
@@ -294,7 +294,13 @@ fn described(body: &[u8], folder: &Path) -> Result<Image, Refusal> {
     let size: [u32; 2] = [side("width")?, side("height")?];
     let id = parameters.take("id").map_or_else(|| Ok(Id::new()), Id::chosen)?;
     let (method, seed) = parameters.method()?;
-    let stitcher = Stitcher::new(size[0], size[1], folder)?;
+    let (pixels, most) = (u64::from(size[0]) * u64::from(size[1]), config.image_pixels);
+    if pixels > most {
+        let detail =
+            format!("{} x {} is {pixels} pixels: this service takes images of {most} at most", size[0], size[1]);
+        return Err(Refusal::new(StatusCode::PAYLOAD_TOO_LARGE, "image_too_large", "The image is too large", detail));
+    }
+    let stitcher = Stitcher::new(size[0], size[1], &config.data_dir)?;
     let canvas = RwLock::new(Canvas { stitcher, seconds: HashMap::new() });
     Ok(Image { id, size, method: Arc::new(method), seed, channels: OnceLock::new(), canvas })
 }
@@ -305,7 +311,7 @@ pub(super) async fn open(State(service): State<Shared>, request: Request) -> Res
     let (parts, body) = request.into_parts();
     let body = Frames::new(&parts.headers, body, service.config.idle_deadline)?.all(MAX_JSON).await?;
     let (status, image) = blocking(move || {
-        let image = described(&body, &service.config.data_dir)?;
+        let image = described(&body, &service.config)?;
         let (new, image) = service.images.open(image)?;
         let status = if new { StatusCode::CREATED } else { StatusCode::OK };
         Ok::<_, Refusal>((status, image))

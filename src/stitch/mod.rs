@@ -17,6 +17,7 @@
 //! | stored | repeated | conflict | filtered, and takes the old one's place |
 //! | claimed | filtered too; the second to arrive is repeated | busy | filtered; the one offered last stays |
 //!
+//! A stored core that lacked halo is not repeated but filtered again, and takes its own place, with `replace`.
 //! A core that overlaps a stored or claimed one without being equal to it is refused, `replace` or not.
 //!
 //! The stitcher does no locking and no waiting; an image has one owner that all calls go through.
@@ -147,6 +148,14 @@ struct Stored {
     report: Report,
 }
 
+impl Stored {
+    /// Whether the same samples need not be filtered again: they were, and with all the halo that the method reads, or
+    /// nobody asks for better.
+    fn done_with(&self, digest: Digest, replace: bool) -> bool {
+        self.digest == digest && (self.report.exact() || !replace)
+    }
+}
+
 #[derive(Debug)]
 struct Pending {
     digest: Digest,
@@ -244,7 +253,9 @@ impl Stitcher {
         if let Some(entry) = self.coverage.get_mut(&core) {
             entry.forget_dead();
             match &entry.stored {
-                Some(stored) if stored.digest == digest && entry.pending.iter().all(|p| p.digest == digest) => {
+                Some(stored)
+                    if stored.done_with(digest, replace) && entry.pending.iter().all(|p| p.digest == digest) =>
+                {
                     return Ok(Offer::Repeated);
                 }
                 Some(stored) if stored.digest != digest && !replace => return Err(StitchError::Conflict(core)),
@@ -276,12 +287,12 @@ impl Stitcher {
         let mine = entry.pending.iter().position(|pending| pending.alive.as_ptr() == Arc::as_ptr(&claim.alive));
         entry.pending.swap_remove(mine.ok_or(StitchError::Mismatch(core))?);
         match &mut entry.stored {
-            Some(stored) if stored.digest == claim.digest => {
+            Some(stored) if stored.done_with(claim.digest, claim.replace) => {
                 stored.turn = stored.turn.max(claim.turn);
                 return Ok(Added::Repeated);
             }
             Some(stored) if stored.turn > claim.turn => return Err(StitchError::Superseded(core)),
-            Some(_) if !claim.replace => return Err(StitchError::Conflict(core)),
+            Some(stored) if stored.digest != claim.digest && !claim.replace => return Err(StitchError::Conflict(core)),
             _ => {}
         }
         if entry.stored.take().is_some() {

@@ -34,6 +34,8 @@ fn an_id_stands_for_one_image() {
     assert_eq!(server.get("/v1/images").json()["images"].as_array().unwrap().len(), 2);
     assert_eq!(server.call("DELETE", &format!("/v1/images/{id}"), &[], &[]).status, 204);
     server.get(&format!("/v1/images/{id}")).problem(404, "unknown_image");
+    let huge = server.post("/v1/images", br#"{"width": 1048576, "height": 1025}"#);
+    huge.problem(413, "image_too_large");
 }
 
 #[test]

@@ -107,6 +107,26 @@ fn the_same_core_again() {
     assert_eq!(code(stitcher.offer(core, digest(1), false)), "tile-conflict");
 }
 
+/// A core that lacked halo is filtered again on request, with the same samples, and then no more.
+#[test]
+fn an_inexact_core_can_be_replaced_by_itself() {
+    let core = Rect::new(16, 16, 16, 16);
+    let mut stitcher = stitcher();
+    let first = claim(&mut stitcher, core, A, false);
+    let mut poor = filtered(core);
+    poor.report.halo_needed.left = 9;
+    poor.rgb[0][0] = 7.0;
+    assert_eq!(stitcher.add(first, &poor).unwrap(), Added::Stored);
+    assert!(matches!(stitcher.offer(core, A, false).unwrap(), Offer::Repeated));
+    let again = claim(&mut stitcher, core, A, true);
+    assert_eq!(stitcher.add(again, &filtered(core)).unwrap(), Added::Stored);
+    let mut pixel = [[0.0; 3]];
+    stitcher.pixels().read(Rect::new(16, 16, 1, 1), &mut pixel).unwrap();
+    assert_eq!(pixel[0][0], value(16, 16, 0));
+    assert!(matches!(stitcher.offer(core, A, true).unwrap(), Offer::Repeated));
+    assert_eq!(stitcher.pixels_done(), 256);
+}
+
 #[test]
 fn two_requests_with_one_core_at_once() {
     let core = Rect::new(0, 0, 8, 8);
