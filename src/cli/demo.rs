@@ -87,7 +87,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let found = [(against(mean)?, unfiltered), (against(denoised)?, filtered.seconds)];
     let files = [before, after, picture];
     if args.json {
-        println!("{:#}", report(&method, &input, &found, &filtered, &files));
+        say!("{:#}", report(&method, &input, &found, &filtered, &files));
     } else {
         print(&method, &input, &found, &filtered, &files);
     }
@@ -228,25 +228,25 @@ fn report(method: &Method, input: &Input, found: &Found, filtered: &Filtered, fi
 fn print(method: &Method, input: &Input, found: &Found, filtered: &Filtered, files: &[PathBuf; 3]) {
     let [width, height] = input.image();
     let Filtered { address, sent, threads, .. } = filtered;
-    println!("depth of field, {width} x {height} pixels, {} samples, by Mitsuba 3", input.summary.samples);
-    println!(
+    say!("depth of field, {width} x {height} pixels, {} samples, by Mitsuba 3", input.summary.samples);
+    say!(
         "{} tiles ({}) through the service at http://{address}, preset {}, {threads} threads\n",
         sent.tiles,
         indicatif::HumanBytes(sent.bytes),
         method.preset_name()
     );
-    println!("{:<26} {:>10} {:>10} {:>8}", "", "before", "after", "");
+    say!("{:<26} {:>10} {:>10} {:>8}", "", "before", "after", "");
     let [(before, mean), (after, seconds)] = found;
     let row = |name: &str, get: fn(&Errors) -> f64| {
         let (before, after) = (get(before), get(after));
-        println!("{name:<26} {before:>10.5} {after:>10.5} {:>7.1}x", before / after);
+        say!("{name:<26} {before:>10.5} {after:>10.5} {:>7.1}x", before / after);
     };
     row("relMSE", |e| e.relmse);
     row("relMSE, worst 0.1 % off", |e| e.relmse_trimmed);
     row("MSE", |e| e.mse);
     row("SMAPE", |e| e.smape);
-    println!("{:<26} {:>10.2} {:>10.2} {:>+7.1}", "PSNR, dB", before.psnr, after.psnr, after.psnr - before.psnr);
-    println!("{:<26} {mean:>10.2} {seconds:>10.2}", "seconds");
-    println!("\nthe reference's own relMSE is {REFERENCE_RELMSE:.1e}");
-    files.iter().for_each(|path| println!("{}", path.display()));
+    say!("{:<26} {:>10.2} {:>10.2} {:>+7.1}", "PSNR, dB", before.psnr, after.psnr, after.psnr - before.psnr);
+    say!("{:<26} {mean:>10.2} {seconds:>10.2}", "seconds");
+    say!("\nthe reference's own relMSE is {REFERENCE_RELMSE:.1e}");
+    files.iter().for_each(|path| say!("{}", path.display()));
 }

@@ -103,7 +103,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.json {
         let mut report = report;
         report["files"] = files.into();
-        println!("{report:#}");
+        say!("{report:#}");
     } else {
         print_summary(args, &run, seconds);
     }
@@ -153,8 +153,6 @@ pub(crate) struct Offline<'a> {
 pub(crate) struct Run {
     pub(crate) stitcher: Stitcher,
     schedule: Schedule,
-    /// How many tiles did without a plane, by its name and why.
-    left_out: BTreeMap<(String, &'static str), u64>,
     /// The narrowest halo that a tile had, by side, of those that needed any there.
     halo_had: Option<Halo>,
 }
@@ -170,7 +168,7 @@ impl Offline<'_> {
         }
         let [width, height] = input.image();
         let stitcher = Stitcher::new(width, height, self.folder)?;
-        let mut run = Run { stitcher, schedule, left_out: BTreeMap::new(), halo_had: None };
+        let mut run = Run { stitcher, schedule, halo_had: None };
         let total = u64::from(width) * u64::from(height);
         let Way::Cut { size, on_disk } = run.schedule.way else {
             self.as_they_come(input, &mut run, &progress::bar("filtering", total))?;
@@ -218,9 +216,9 @@ impl Offline<'_> {
             progress: Some(&advance),
             ..Execution::default()
         };
-        let mut filtered = filter(tile, &self.method, &execution)?;
+        let filtered = filter(tile, &self.method, &execution)?;
         bar.set_position(before + core.area());
-        run.note(&mut filtered);
+        run.note(&filtered);
         // No core comes twice: the file was checked for that.
         match run.stitcher.offer(core, [0; 32], false)? {
             Offer::Filter(claim) => drop(run.stitcher.add(claim, &filtered)?),
@@ -231,11 +229,8 @@ impl Offline<'_> {
 }
 
 impl Run {
-    /// Sums up what the stitcher does not, and takes it out of the tile's report, of which there may be many.
-    fn note(&mut self, filtered: &mut Filtered) {
-        for left_out in filtered.report.left_out.drain(..) {
-            *self.left_out.entry((left_out.plane, left_out.reason.as_str())).or_default() += 1;
-        }
+    /// Sums up what the stitcher does not.
+    fn note(&mut self, filtered: &Filtered) {
         let (had, needed) = (filtered.report.halo, filtered.report.halo_needed);
         let narrowest =
             self.halo_had.get_or_insert(Halo { left: u32::MAX, top: u32::MAX, right: u32::MAX, bottom: u32::MAX });
@@ -257,7 +252,7 @@ impl Run {
         let totals = self.stitcher.totals();
         let sides = |halo: Halo| [halo.left, halo.top, halo.right, halo.bottom];
         let had = sides(self.halo_had.unwrap_or_default()).map(|side| (side < u32::MAX).then_some(side));
-        let left_out = self.left_out.iter();
+        let left_out = self.stitcher.left_out().iter();
         let (way, spooled) = match self.schedule.way {
             Way::AsTheyCome => (json!("as they come"), json!(null)),
             Way::Cut { size, on_disk } => {
@@ -303,7 +298,7 @@ impl Run {
 fn print_summary(args: &Args, run: &Run, seconds: f64) {
     let totals = run.stitcher.totals();
     let image = run.stitcher.image();
-    println!(
+    say!(
         "{}: {} x {} pixels, {} samples in {} tiles, {seconds:.1} s",
         args.output.display(),
         image.width,
@@ -312,21 +307,21 @@ fn print_summary(args: &Args, run: &Run, seconds: f64) {
         totals.tiles
     );
     if let Some(png) = &args.png {
-        println!("{}: to look at", png.display());
+        say!("{}: to look at", png.display());
     }
-    println!(
+    say!(
         "energy {:.4} of the input's, {} colour values were spikes",
         totals.energy_out / totals.energy_in,
         totals.spikes
     );
     if totals.replaced.total() > 0 {
-        println!("{} values were not finite and were replaced", totals.replaced.total());
+        say!("{} values were not finite and were replaced", totals.replaced.total());
     }
     if totals.unfilled > 0 {
-        println!("{} pixels have no samples anywhere near and stay black", totals.unfilled);
+        say!("{} pixels have no samples anywhere near and stay black", totals.unfilled);
     }
     let missing = image.area() - totals.pixels;
     if missing > 0 {
-        println!("{missing} pixels are missing and are black");
+        say!("{missing} pixels are missing and are black");
     }
 }

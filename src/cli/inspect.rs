@@ -45,7 +45,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let input = Input::scan(&args.input)?;
     let report = report(&input, &method, args.threads.count())?;
     if args.json {
-        println!("{report:#}")
+        say!("{report:#}")
     } else {
         print(&report)
     }
@@ -57,8 +57,14 @@ fn report(input: &Input, method: &Method, threads: usize) -> Result<Value, Failu
     let summary = &input.summary;
     let tiles = || summary.tiles.iter();
     let core_areas = tiles().map(|tile| tile.geometry.core().area());
-    let roles = summary.first.channels().plane_channels().map(|(channel, _)| channel.role);
-    let planes = summary.planes.iter().zip(roles).map(|(plane, role)| {
+    // Zeros that say that there is no such feature, where all of a channel is 0.
+    let zero = |plane: &PlaneSummary| plane.min == 0.0 && plane.max == 0.0 && plane.infinite == 0;
+    let channels = summary.first.channels().plane_channels().enumerate().map(|(index, (channel, component))| {
+        let first = index - component as usize;
+        let all = &summary.planes[first..first + channel.components as usize];
+        (channel.role, channel.zero_is_missing() && all.iter().all(zero))
+    });
+    let planes = summary.planes.iter().zip(channels).map(|(plane, (role, none))| {
         let range = (plane.finite > 0).then_some([plane.min, plane.max]);
         json!({
             "name": plane.name,
@@ -70,7 +76,7 @@ fn report(input: &Input, method: &Method, threads: usize) -> Result<Value, Failu
             "nan": plane.nan,
             "infinite": plane.infinite,
             "constant_tiles": plane.constant_tiles,
-            "left_out": left_out(plane, role, method),
+            "left_out": left_out(plane, role, none, method),
         })
     });
     let planes: Vec<_> = planes.collect();
@@ -136,13 +142,13 @@ const fn role_name(role: Role) -> &'static str {
     }
 }
 
-/// Why a plane has no effect in any tile, if so.
-fn left_out(plane: &PlaneSummary, role: Role, method: &Method) -> Option<&'static str> {
+/// Why a plane has no effect in any tile, if so; `none` says that no sample has the feature.
+fn left_out(plane: &PlaneSummary, role: Role, none: bool, method: &Method) -> Option<&'static str> {
     let holes = plane.nan + plane.infinite;
     match (role, method.algorithm()) {
         (Role::Color, _) => None,
         (_, Algorithm::Unfiltered) => Some("unused"),
-        _ if plane.finite == 0 && plane.infinite == 0 => Some("missing"),
+        _ if none || (plane.finite == 0 && plane.infinite == 0) => Some("missing"),
         _ if plane.min >= plane.max && holes == 0 => Some("constant"),
         _ => None,
     }
@@ -152,17 +158,17 @@ fn print(report: &Value) {
     let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
     let bytes = |value: &Value| HumanBytes(value.as_u64().unwrap_or(0)).to_string();
     let samples = &report["samples"];
-    println!("{}: image {} in {} tiles", text(&report["path"]), report["image"], report["tiles"]);
+    say!("{}: image {} in {} tiles", text(&report["path"]), report["image"], report["tiles"]);
     match samples["per_pixel"].as_u64() {
-        Some(n) => println!("samples: {} in all, {n} per pixel", samples["total"]),
-        None => println!(
+        Some(n) => say!("samples: {} in all, {n} per pixel", samples["total"]),
+        None => say!(
             "samples: {} in all, {:.2} per pixel on average, {} at most",
             samples["total"],
             samples["mean"].as_f64().unwrap_or(0.0),
             samples["most"]
         ),
     }
-    println!("\n{:<16} {:<8} {:<4} {:>13} {:>13} {:>13}", "plane", "role", "", "min", "max", "mean");
+    say!("\n{:<16} {:<8} {:<4} {:>13} {:>13} {:>13}", "plane", "role", "", "min", "max", "mean");
     for plane in report["planes"].as_array().into_iter().flatten() {
         let number = |key: &str| plane[key].as_f64().map_or_else(|| "-".to_owned(), |v| format!("{v:.6}"));
         let mut notes = Vec::new();
@@ -174,18 +180,19 @@ fn print(report: &Value) {
         notes.extend(plane["left_out"].as_str().map(|why| format!("left out: {why}")));
         let (name, role, format) = (text(&plane["name"]), text(&plane["role"]), text(&plane["format"]));
         let (min, max, mean) = (number("min"), number("max"), number("mean"));
-        println!("{name:<16} {role:<8} {format:<4} {min:>13} {max:>13} {mean:>13}  {}", notes.join(", "));
+        say!("{name:<16} {role:<8} {format:<4} {min:>13} {max:>13} {mean:>13}  {}", notes.join(", "));
     }
-    println!(
+    say!(
         "\nhalo, [left, top, right, bottom]: {} at least, {} at most",
-        report["halo"]["least"], report["halo"]["most"]
+        report["halo"]["least"],
+        report["halo"]["most"]
     );
     for halo in report["halo_needed"].as_array().into_iter().flatten() {
         let (preset, needed, enough) = (text(&halo["preset"]), &halo["needed"], &halo["tiles_with_enough"]);
-        println!("  {preset:<12} needs {needed:>3}: {enough} of {} tiles have it", report["tiles"]);
+        say!("  {preset:<12} needs {needed:>3}: {enough} of {} tiles have it", report["tiles"]);
     }
     let memory = &report["memory"];
-    println!(
+    say!(
         "memory for {} on {} threads: {} for the largest tile as it is; {} to spool all samples",
         text(&report["preset"]),
         memory["threads"],
@@ -193,6 +200,6 @@ fn print(report: &Value) {
         bytes(&memory["spool"])
     );
     for fault in report["faults"].as_array().into_iter().flatten() {
-        println!("wrong: {} ({})", text(&fault["message"]), text(&fault["code"]));
+        say!("wrong: {} ({})", text(&fault["message"]), text(&fault["code"]));
     }
 }

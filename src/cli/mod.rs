@@ -4,6 +4,13 @@
 //! standard output, with `--json` as one JSON object; progress, warnings and errors go to standard error, the error with
 //! `--json` as one JSON object on one line.
 
+/// Prints a line. A reader that has gone, as `head` does, has all that it wanted; any other failure ends the program.
+macro_rules! say {
+    ($($text:tt)*) => {
+        $crate::cli::say(format_args!($($text)*))
+    };
+}
+
 mod args;
 mod demo;
 mod failure;
@@ -62,5 +69,15 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => failure.report(json),
+    }
+}
+
+fn say(line: std::fmt::Arguments) {
+    use std::io::{ErrorKind, Write};
+    if let Err(error) = writeln!(std::io::stdout().lock(), "{line}")
+        && error.kind() != ErrorKind::BrokenPipe
+    {
+        eprintln!("rpfd: standard output: {error} (output_io)");
+        std::process::exit(1);
     }
 }

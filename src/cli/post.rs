@@ -116,10 +116,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             "id": id, "image": input.image(), "seconds": seconds, "tiles": tiles, "repeated": repeated,
             "bytes_sent": bytes, "files": [{ "path": args.output }],
         });
-        println!("{report:#}");
+        say!("{report:#}");
     } else {
         let (output, bytes) = (args.output.display(), HumanBytes(bytes));
-        println!("{output}: {tiles} tiles sent ({bytes}), {repeated} of them were there already, {seconds:.1} s");
+        say!("{output}: {tiles} tiles sent ({bytes}), {repeated} of them were there already, {seconds:.1} s");
     }
     Ok(())
 }

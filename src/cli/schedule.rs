@@ -1,6 +1,6 @@
 //! How to get through a file of tiles within a budget of memory: as they come, or cut anew from a spool.
 //!
-//! Tiles that bring the halo that the method reads, and fit, are filtered as they come. All others are cut from the cores
+//! Tiles of a whole image that bring the halo that the method reads, and fit, are filtered as they come. All others are cut from the cores
 //! by the least work that fits: in memory if large tiles fit beside the spool, else from a temporary file. The pixels
 //! are the same either way.
 
@@ -50,10 +50,12 @@ impl Schedule {
         let summary = &input.summary;
         let planes = summary.first.channels().planes() as u64;
         let records = |tiles: u64| tiles * (PER_TILE + PER_PLANE * planes) + BUFFERS;
-        let ready = summary.tiles.iter().all(|tile| {
-            let needed = tile.geometry.halo_for(method.reach(tile.varying));
-            tile.geometry.halo().covers(&needed)
-        });
+        // A halo may hold samples of missing tiles, which a spool of cores has not: the image must not depend on the way.
+        let ready = summary.missing.is_empty()
+            && summary.tiles.iter().all(|tile| {
+                let needed = tile.geometry.halo_for(method.reach(tile.varying));
+                tile.geometry.halo().covers(&needed)
+            });
         if ready {
             let largest = summary.tiles.iter().map(|tile| cost(&input.shape_of(tile))).max().unwrap_or(0);
             let bytes = largest + records(summary.tiles.len() as u64) + summary.window_bytes;

@@ -99,12 +99,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let seconds = started.elapsed().as_secs_f64();
     report["seconds"] = seconds.into();
     if args.json {
-        println!("{report:#}");
+        say!("{report:#}");
     } else {
         let Written { tiles, samples } = written;
-        println!("{}: {samples} samples in {tiles} tiles, {seconds:.1} s", args.output.display());
+        say!("{}: {samples} samples in {tiles} tiles, {seconds:.1} s", args.output.display());
         if let (Some(path), Some(relmse)) = (&args.reference, report["reference"]["relmse"].as_f64()) {
-            println!("{}: its own relMSE is about {relmse:.2e}", path.display());
+            say!("{}: its own relMSE is about {relmse:.2e}", path.display());
         }
     }
     Ok(())

@@ -12,11 +12,11 @@ use std::collections::{BTreeMap, HashMap};
 pub struct Coverage<T> {
     /// By (y, x) of the corner.
     cores: BTreeMap<(u32, u32), (Rect, T)>,
-    grids: BTreeMap<(u32, u32), Grid>,
+    grids: BTreeMap<(u32, u32), Cells>,
 }
 
 /// Cores by (row, column) of the cell that holds their corner.
-type Grid = BTreeMap<(u32, u32), Vec<Rect>>;
+type Cells = BTreeMap<(u32, u32), Vec<Rect>>;
 
 impl<T> Default for Coverage<T> {
     fn default() -> Self {
@@ -71,10 +71,28 @@ impl<T> Coverage<T> {
     pub fn remove(&mut self, core: &Rect) -> Option<T> {
         self.get(core)?;
         let (class, cell) = place(core);
-        if let Some(cores) = self.grids.get_mut(&class).and_then(|grid| grid.get_mut(&cell)) {
-            cores.retain(|other| other != core);
+        if let Some(grid) = self.grids.get_mut(&class) {
+            if let Some(cores) = grid.get_mut(&cell) {
+                cores.retain(|other| other != core);
+                if cores.is_empty() {
+                    grid.remove(&cell);
+                }
+            }
+            if grid.is_empty() {
+                self.grids.remove(&class);
+            }
         }
         self.cores.remove(&(core.y, core.x)).map(|(_, value)| value)
+    }
+
+    /// Number of known cores.
+    pub fn len(&self) -> usize {
+        self.cores.len()
+    }
+
+    /// Whether no core is known.
+    pub fn is_empty(&self) -> bool {
+        self.cores.is_empty()
     }
 
     /// All known cores, by rows: ordered by y, then by x.

@@ -47,7 +47,9 @@ pub fn plan(shape: &Shape, method: &Method) -> Plan {
     // 4 bytes a value; where counts vary, a start and, while it is read, a count per pixel.
     let starts = if shape.varying { pixels * (4 + 2) + 4 } else { 0 };
     let samples = shape.samples * 4 * shape.channels.planes() as u64 + starts;
-    let output = shape.geometry.core().area() * 12 + FIXED;
+    // The report may name every plane.
+    let names: u64 = shape.channels.plane_channels().map(|(channel, _)| channel.name.len() as u64 + 64).sum();
+    let output = shape.geometry.core().area() * 12 + FIXED + 2 * names;
     let own = match method.algorithm() {
         Algorithm::Unfiltered => Plan::default(),
         Algorithm::Rpf(params) => super::rpf::plan(shape, params),

@@ -49,8 +49,9 @@ impl Channel {
         Self { name: name.into(), role, components }
     }
 
-    /// Whether a sample whose components are all 0 (or NaN) has no such feature, as the papers encode it: world
-    /// positions, and the normals that everyone calls `N` and `N2`, since no normal is 0. (An albedo of 0 is black.)
+    /// Whether a sample whose components are all 0 has no such feature, as the papers encode it: world positions, and the
+    /// normals that everyone calls `N` and `N2`, since no normal is 0. (An albedo of 0 is black.) Of these a sample has
+    /// all components or none: one that is NaN stands for all.
     pub fn zero_is_missing(&self) -> bool {
         match self.role {
             Role::Feature { position } => position || matches!(self.name.as_str(), "N" | "N2"),
@@ -389,7 +390,7 @@ impl SampleTile {
         for channel in self.channels.channels() {
             let components = channel.components as usize;
             if channel.zero_is_missing() {
-                zero_to_missing(&mut self.planes[first..first + components], self.layout.total());
+                unite_missing(&mut self.planes[first..first + components], self.layout.total());
             }
             first += components;
         }
@@ -449,20 +450,24 @@ impl SampleTile {
     }
 }
 
-/// Sets samples whose components are all 0 (or missing already) to missing. A component that is 0 throughout may stay so:
-/// the others say it.
-fn zero_to_missing(components: &mut [Plane], samples: usize) {
-    let zero = |value: f32| value == 0.0 || value.is_nan();
-    if components.iter().all(|plane| matches!(plane, Plane::Constant(value) if zero(*value))) {
-        components.fill(Plane::Constant(f32::NAN));
-        return;
-    }
-    for sample in 0..samples {
+/// Makes a sample that lacks any component, or whose components are all 0, lack all of them. A component that is constant
+/// may stay so: the others say it.
+fn unite_missing(components: &mut [Plane], samples: usize) {
+    let missing = |components: &[Plane], sample: usize| {
         let value = |plane: &Plane| match plane {
             Plane::Constant(value) => *value,
             Plane::Values(values) => values[sample],
         };
-        if components.iter().all(|plane| zero(value(plane))) {
+        components.iter().any(|plane| value(plane).is_nan()) || components.iter().all(|plane| value(plane) == 0.0)
+    };
+    if components.iter().all(|plane| matches!(plane, Plane::Constant(_))) {
+        if missing(components, 0) {
+            components.fill(Plane::Constant(f32::NAN));
+        }
+        return;
+    }
+    for sample in 0..samples {
+        if missing(components, sample) {
             for plane in components.iter_mut() {
                 if let Plane::Values(values) = plane {
                     values[sample] = f32::NAN;

@@ -3,6 +3,7 @@
 use std::{
     collections::{BTreeMap, HashMap},
     hash::{BuildHasher, RandomState},
+    io::{self, Write},
     sync::{Arc, Mutex, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard},
 };
 
@@ -17,7 +18,7 @@ use serde_json::{Value, json};
 use super::{
     Shared,
     body::Frames,
-    picture::{encode_png, write_picture},
+    picture::{encode_png, write_file},
     problem::{Refusal, corners},
     query::{Form, Parameters, attributes},
     results::file_response,
@@ -36,6 +37,8 @@ const MAX_JSON: usize = 64 << 10;
 const MAX_ID: usize = 128;
 /// Most missing regions that a problem lists; it says how many there are.
 const MAX_LISTED: usize = 1000;
+/// Tiles of an image at most: each is kept track of in memory, a few hundred bytes.
+const MAX_TILES: usize = 1 << 17;
 
 /// The id of an image, from the path of a request.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -149,7 +152,13 @@ impl Image {
         self.channels.get_or_init(|| tile.channels().clone());
         self.check(tile.geometry().image(), tile.channels())?;
         let digest = digest(tile);
-        match self.write().stitcher.offer(tile.geometry().core(), digest, replace)? {
+        let mut canvas = self.write();
+        if canvas.stitcher.known() >= MAX_TILES {
+            let detail = format!("an image has {MAX_TILES} tiles at most: send larger ones");
+            let title = "The image has too many tiles";
+            return Err(Refusal::new(StatusCode::UNPROCESSABLE_ENTITY, "too_many_tiles", title, detail));
+        }
+        match canvas.stitcher.offer(tile.geometry().core(), digest, replace)? {
             Offer::Repeated => Ok(Outcome::Repeated),
             Offer::Filter(claim) => Ok(Outcome::Filter(claim)),
         }
@@ -184,21 +193,12 @@ impl Image {
         })
     }
 
-    fn status(&self) -> Value {
+    /// Writes all that there is to say, the tiles one by one: there may be many.
+    fn write_status(&self, out: &mut impl Write) -> io::Result<()> {
         let mut status = self.summary();
         let canvas = self.read();
         let stitcher = &canvas.stitcher;
         status["missing"] = stitcher.missing().into_iter().map(|rect| json!(corners(rect))).collect();
-        let tiles = stitcher.tiles().map(|(core, report)| {
-            let seconds = canvas.seconds.get(&core).copied().unwrap_or(0.0);
-            let mut report = json!(TileReport::new(report, &self.method, self.seed, seconds));
-            // The same for all tiles, and said above.
-            if let Value::Object(report) = &mut report {
-                report.retain(|name, _| !["preset", "seed", "parameters"].contains(&name.as_str()));
-            }
-            json!({ "tile": corners(core), "report": report })
-        });
-        status["tiles"] = tiles.collect();
         let totals = stitcher.totals();
         let (replaced, needed) = (totals.replaced, totals.halo_needed);
         status["totals"] = json!({
@@ -220,7 +220,25 @@ impl Image {
             "short_of_halo": totals.short_of_halo,
             "halo_needed": [needed.left, needed.top, needed.right, needed.bottom],
         });
-        status
+        let left_out = stitcher.left_out().iter();
+        status["totals"]["left_out"] = left_out
+            .map(|((plane, reason), tiles)| json!({ "plane": plane, "reason": reason, "tiles": tiles }))
+            .collect();
+        // The object, but for its last brace.
+        let mut head = status.to_string();
+        head.pop();
+        write!(out, "{head},\"tiles\":[")?;
+        for (i, (core, report)) in stitcher.tiles().enumerate() {
+            let seconds = canvas.seconds.get(&core).copied().unwrap_or(0.0);
+            let mut report = json!(TileReport::new(report, &self.method, self.seed, seconds));
+            // The same for all tiles, or told of all of them together, above.
+            if let Value::Object(report) = &mut report {
+                report.retain(|name, _| !["preset", "seed", "parameters", "left_out"].contains(&name.as_str()));
+            }
+            let comma = if i == 0 { "" } else { "," };
+            write!(out, "{comma}{}", json!({ "tile": corners(core), "report": report }))?;
+        }
+        write!(out, "]}}")
     }
 
     /// Refuses while pixels are missing, and says which.
@@ -331,9 +349,10 @@ pub(super) async fn list(State(service): State<Shared>) -> Result<Json<Value>, R
 }
 
 /// `GET /v1/images/{id}`.
-pub(super) async fn status(State(service): State<Shared>, id: Id) -> Result<Json<Value>, Refusal> {
+pub(super) async fn status(State(service): State<Shared>, id: Id) -> Result<Response, Refusal> {
     let image = service.images.find(&id)?;
-    Ok(Json(blocking(move || image.status()).await?))
+    let file = blocking(move || write_file(&service.config.data_dir, |out| Ok(image.write_status(out)?)));
+    Ok(file_response(file.await??, "application/json").await?)
 }
 
 /// `DELETE /v1/images/{id}`.
@@ -355,7 +374,7 @@ pub(super) async fn result(State(service): State<Shared>, id: Id, request: Reque
     let file = blocking(move || {
         let stitcher = &image.read().stitcher;
         image.check_complete(stitcher, partial)?;
-        write_picture(&service.config.data_dir, |out| Ok(stitcher.encode_exr(&options, partial, out).map(drop)?))
+        write_file(&service.config.data_dir, |out| Ok(stitcher.encode_exr(&options, partial, out).map(drop)?))
     });
     Ok(file_response(file.await??, Form::Exr.media()).await?)
 }
@@ -369,7 +388,7 @@ pub(super) async fn preview(State(service): State<Shared>, id: Id, request: Requ
     let file = blocking(move || {
         let stitcher = &image.read().stitcher;
         image.check_complete(stitcher, partial)?;
-        write_picture(&service.config.data_dir, |out| encode_png(&stitcher.pixels(), out))
+        write_file(&service.config.data_dir, |out| encode_png(&stitcher.pixels(), out))
     });
     Ok(file_response(file.await??, Form::Png.media()).await?)
 }

@@ -1,4 +1,5 @@
-//! Pictures as answers: written to a file without a name first, so that their length and their success are known.
+//! Long answers, pictures mostly: written to a file without a name first, so that their length and their success are
+//! known.
 
 use std::{
     fs::File,
@@ -13,8 +14,8 @@ use crate::{
     stitch::{CanvasError, Pixels},
 };
 
-/// Writes a picture to a file without a name in this folder. Blocks.
-pub(super) fn write_picture(
+/// Writes an answer to a file without a name in this folder. Blocks.
+pub(super) fn write_file(
     folder: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), Refusal>,
 ) -> Result<File, Refusal> {

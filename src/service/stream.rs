@@ -27,7 +27,7 @@ use super::{
     Shared,
     body::Frames,
     images::{Id, Image, Outcome},
-    picture::{CorePixels, encode_png, write_picture},
+    picture::{CorePixels, encode_png, write_file},
     problem::{Refusal, corners, internal},
     query::{Form, Parameters, attributes},
     receive::{Fault, Received, Receiver},
@@ -353,7 +353,7 @@ fn picture(
         options.attributes.insert("rpfd:tile".into(), geometry.core().to_string());
     }
     let pixels = CorePixels(&done.filtered);
-    write_picture(&call.service.config.data_dir, |out| match form {
+    write_file(&call.service.config.data_dir, |out| match form {
         Form::Png => encode_png(&pixels, out),
         _ => Ok(crate::stitch::exr::encode(&pixels, &options, out).map(drop)?),
     })

@@ -6,8 +6,8 @@ use crate::filter::{Role, SampleTile};
 /// The digest of a core's samples: where the core lies, the channels, the sample counts, and every value, by rows.
 ///
 /// It does not depend on the halo, nor on whether a plane was sent as one constant; what was not finite counts as what it
-/// was replaced by, and all missing features (NaN) are equal, with the component that stayed 0 because it is 0 all over the
-/// data window or without it. Takes one pass over the core's samples and 64 KiB.
+/// was replaced by, and missing features (NaN) are all equal, whatever a component that is constant in the data window
+/// holds for them. Takes one pass over the core's samples and 64 KiB.
 pub fn digest(tile: &SampleTile) -> Digest {
     let (image, core, window) = (tile.geometry().image(), tile.geometry().core(), tile.geometry().window());
     let mut out = Hasher { hash: blake3::Hasher::new(), bytes: Vec::with_capacity(1 << 16) };
@@ -37,9 +37,8 @@ pub fn digest(tile: &SampleTile) -> Digest {
             let end = tile.samples_of(window.index(core.right() - 1, y)).end;
             for sample in first..end {
                 let value = tile.value(plane, sample);
-                let zero = |value: f32| value == 0.0 || value.is_nan();
-                let none = zero(value) && !siblings.is_empty() && siblings.clone().all(|p| zero(tile.value(p, sample)));
-                out.number(if value.is_nan() || none { f32::NAN.to_bits() } else { value.to_bits() });
+                let missing = value.is_nan() || siblings.clone().any(|p| tile.value(p, sample).is_nan());
+                out.number(if missing { f32::NAN.to_bits() } else { value.to_bits() });
             }
         }
     }

@@ -32,11 +32,12 @@ pub use digest::digest;
 pub use exr::{ExrCompression, ExrError, ExrLayout, ExrOptions, ExrSamples, ExrSummary};
 
 use crate::filter::{
-    Coverage, Filtered, Rect, Report, TileGeometry,
+    Coverage, Filtered, LeftOut, Rect, Report, TileGeometry,
     geometry::{GeometryError, Halo},
     samples::Replaced,
 };
 use std::{
+    collections::BTreeMap,
     path::Path,
     sync::{Arc, Weak},
 };
@@ -227,6 +228,8 @@ impl Totals {
 /// An image being assembled.
 #[derive(Debug)]
 pub struct Stitcher {
+    /// How many tiles did without a plane, by its name and why; not kept tile by tile, since the names are many bytes.
+    left_out: BTreeMap<(String, &'static str), u64>,
     coverage: Coverage<Entry>,
     canvas: Canvas,
     done: u64,
@@ -242,7 +245,7 @@ impl Stitcher {
 
     /// An image on a given canvas, none of whose pixels count yet: see [`Self::restore`].
     pub fn on(canvas: Canvas) -> Self {
-        Self { coverage: Coverage::default(), canvas, done: 0, turn: 0 }
+        Self { coverage: Coverage::default(), canvas, done: 0, turn: 0, left_out: BTreeMap::new() }
     }
 
     /// Asks whether a core, made from samples with this digest, is wanted.
@@ -300,7 +303,11 @@ impl Stitcher {
         }
         let [r, g, b] = &filtered.rgb;
         self.canvas.write(core, [r, g, b])?;
-        entry.stored = Some(Stored { digest: claim.digest, turn: claim.turn, report: filtered.report.clone() });
+        let mut report = filtered.report.clone();
+        for LeftOut { plane, reason } in std::mem::take(&mut report.left_out) {
+            *self.left_out.entry((plane, reason.as_str())).or_default() += 1;
+        }
+        entry.stored = Some(Stored { digest: claim.digest, turn: claim.turn, report });
         self.done += area;
         Ok(Added::Stored)
     }
@@ -367,6 +374,17 @@ impl Stitcher {
     /// The stored tiles by rows, with their reports.
     pub fn tiles(&self) -> impl Iterator<Item = (Rect, &Report)> {
         self.coverage.iter().filter_map(|(core, entry)| Some((core, &entry.stored.as_ref()?.report)))
+    }
+
+    /// How many times a tile was stored that did without a plane, by the plane's name and the reason. The tiles' own
+    /// reports ([`Self::tiles`]) do not say it.
+    pub const fn left_out(&self) -> &BTreeMap<(String, &'static str), u64> {
+        &self.left_out
+    }
+
+    /// Number of stored and claimed tiles.
+    pub fn known(&self) -> usize {
+        self.coverage.len()
     }
 
     /// Sums over the stored tiles; the same whatever the order of arrival.

@@ -133,3 +133,12 @@ fn an_interrupt_leaves_nothing_behind() {
     assert!(stderr(&output).contains("interrupted"));
     assert_eq!(folder.names(), [""; 0]);
 }
+
+/// As in `rpfd inspect FILE | head -n 1`.
+#[test]
+fn a_reader_that_goes_is_no_failure() {
+    let command = format!("'{}' inspect '{}' | true", env!("CARGO_BIN_EXE_rpfd"), data("small.tiles.zst").display());
+    let output = Command::new("sh").args(["-c", &command]).output().unwrap();
+    assert!(output.status.success());
+    assert_eq!(stderr(&output), "");
+}

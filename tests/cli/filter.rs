@@ -123,6 +123,26 @@ fn missing_tiles_are_refused_unless_partial() {
     assert!(bytes(out) == bytes(again));
 }
 
+/// A halo may bring samples of tiles that are missing: what there is of the image must not depend on the memory.
+#[test]
+fn a_partial_image_does_not_depend_on_the_memory() {
+    let folder = Folder::new();
+    let (all, some) = (folder.path("all.tiles"), folder.path("some.tiles"));
+    json(["synth", "--size", "64x64", "--spp", "4", "--tile", "32", "--halo", "20", "-o", &all]);
+    let (mut file, mut out) = (TileFile::open(&all).unwrap(), TileWriter::create(&some).unwrap());
+    for _ in 0..3 {
+        let (header, tile) = file.next_tile().unwrap().unwrap();
+        out.write_tile(&header, &tile).unwrap();
+    }
+    out.finish().unwrap();
+    let run = |memory: &str| {
+        let out = folder.path(&format!("{memory}.exr"));
+        json(["filter", &some, "-o", &out, "--partial", "--threads", "1", "--memory", memory]);
+        std::fs::read(out).unwrap()
+    };
+    assert!(run("1GiB") == run("8MiB"));
+}
+
 #[test]
 fn the_exr_is_as_asked_for() {
     let folder = Folder::new();

@@ -72,7 +72,8 @@ fn filter_block<S: Simd, const N: usize>(simd: S, distances: &Distances, first: 
             let Span { min, max, scale } = spans[k];
             // The mean lies between the least and the greatest value; rounding must not take it out, nor to infinity.
             let mean = (sum(sums[n][k]) / weight).max(min * scale).min(max * scale);
-            out[k] = mean / scale;
+            // What underflows to -0 becomes 0.
+            out[k] = mean / scale + 0.0;
         }
     }
 }

@@ -34,7 +34,7 @@ impl Grid {
 
     /// Nodes in x and y around the pixels of a region.
     fn nodes_of(spacing: u32, region: &Rect) -> [usize; 2] {
-        let count = |start: u32, end: u32| ((end - 1) / spacing + 2 - start / spacing) as usize;
+        let count = |start: u32, end: u32| ((end - 1).div_ceil(spacing) + 1 - start / spacing) as usize;
         [count(region.x, region.right()), count(region.y, region.bottom())]
     }
 
@@ -118,7 +118,7 @@ impl GridRows {
         let y = self.rows[row];
         let window = pass.tile.geometry().window();
         for (&x, node) in self.columns.iter().zip(nodes.chunks_exact_mut(self.values)) {
-            if window.contains(x, y) && pass.weigh(simd, scratch, x, y) {
+            if !pass.execution.stopped() && window.contains(x, y) && pass.weigh(simd, scratch, x, y) {
                 let Weights { color, features, confidence } = &scratch.weights;
                 node[..3].copy_from_slice(color);
                 node[3] = *confidence;

@@ -247,6 +247,7 @@ impl Pass<'_> {
         }
         let order = ColumnOrder::of(self.relevant);
         let spans = self.load_radiance(simd, scratch);
+        // Without weights around, the pixel's own: they load every column; else only those that count are loaded below.
         let interpolated = grid.is_some_and(|grid| grid.interpolate(x, y, &mut scratch.weights));
         if !interpolated {
             self.weigh_gathered(simd, scratch, &spans);
@@ -306,10 +307,10 @@ impl Pass<'_> {
         let start = self.tile.samples_of(window.index(window.x, band.y)).start;
         // Column by column, so that what one neighbourhood has brought into the cache serves the next.
         for x in band.x..band.right() {
-            if self.execution.stopped() {
-                return;
-            }
             for y in band.y..band.bottom() {
+                if self.execution.stopped() {
+                    return;
+                }
                 let samples = self.tile.samples_of(window.index(x, y));
                 let out = &mut out[3 * (samples.start - start)..3 * (samples.end - start)];
                 self.pixel(simd, scratch, grid, x, y, out);

@@ -101,7 +101,7 @@ pub(super) fn filter(tile: &SampleTile, params: &Params, execution: &Execution) 
         left_out: relevant.left_out,
         ..Report::default()
     };
-    Ok(finish(tile, &colors, params.fill_reach(), report))
+    finish(tile, &colors, params.fill_reach(), report, execution)
 }
 
 /// The colours of all samples, R, G, B next to each other.
@@ -128,9 +128,7 @@ fn run(pass: &Pass, region: &Rect, scratches: &mut [Scratch], next: &mut [f32]) 
         let mut grid = Grid::new(spacing, image, region, pass.relevant.features().len());
         let (rows, nodes) = grid.rows();
         share_out(execution, scratches, nodes, |scratch, (row, nodes)| {
-            if !execution.stopped() {
-                dispatch!(level, simd => rows.weigh(simd, pass, scratch, row, nodes));
-            }
+            dispatch!(level, simd => rows.weigh(simd, pass, scratch, row, nodes));
         });
         grid
     });
@@ -177,12 +175,21 @@ fn share_out<T: Send>(
 }
 
 /// The mean of each core pixel's samples; pixels without any are filled from those around them.
-fn finish(tile: &SampleTile, colors: &[f32], fill_reach: u32, mut report: Report) -> Filtered {
+fn finish(
+    tile: &SampleTile,
+    colors: &[f32],
+    fill_reach: u32,
+    mut report: Report,
+    execution: &Execution,
+) -> Result<Filtered, Stopped> {
     let (core, window) = (tile.geometry().core(), tile.geometry().window());
     let planes = tile.channels().color_planes();
     let mut rgb = [(); 3].map(|()| Vec::with_capacity(core.area() as usize));
     for y in core.y..core.bottom() {
         for x in core.x..core.right() {
+            if execution.stopped() {
+                return Err(Stopped);
+            }
             let samples = tile.samples_of(window.index(x, y));
             report.samples += samples.len() as u64;
             for plane in planes {
@@ -199,7 +206,7 @@ fn finish(tile: &SampleTile, colors: &[f32], fill_reach: u32, mut report: Report
             }
         }
     }
-    Filtered { core, rgb, report }
+    Ok(Filtered { core, rgb, report })
 }
 
 /// Mean of a pixel's filtered samples; none if it has no samples.
@@ -212,12 +219,20 @@ fn pixel_mean(tile: &SampleTile, colors: &[f32], x: u32, y: u32) -> Option<[f64;
 
 /// Mean of the filtered pixels in the smallest window around a pixel that has any.
 fn fill(tile: &SampleTile, colors: &[f32], x: u32, y: u32, reach: u32) -> Option<[f64; 3]> {
+    if tile.total() == 0 {
+        return None;
+    }
     let window = tile.geometry().window();
     (1..=reach).find_map(|radius| {
         let around = Rect::new(x, y, 1, 1).grown(radius, &window);
         let (mut sum, mut count) = ([0.0; 3], 0.0);
-        for y in around.y..around.bottom() {
-            for mean in (around.x..around.right()).filter_map(|x| pixel_mean(tile, colors, x, y)) {
+        let across = around.x..around.right();
+        for row in around.y..around.bottom() {
+            // Nearer pixels have no samples, else a smaller window would have done: only the ring is new.
+            let edge = row.abs_diff(y) == radius;
+            let sides = [x.wrapping_sub(radius), x + radius].into_iter().filter(|side| !edge && across.contains(side));
+            let ring = if edge { across.clone() } else { 0..0 }.chain(sides);
+            for mean in ring.filter_map(|x| pixel_mean(tile, colors, x, row)) {
                 sum = std::array::from_fn(|k| sum[k] + mean[k]);
                 count += 1.0;
             }

@@ -212,6 +212,48 @@ fn a_component_that_is_zero_in_a_tile_only_gives_the_whole_images_bits() {
     }
 }
 
+/// Partly missing positions and normals: of these a sample has all components or none, in every tile.
+#[test]
+fn partly_missing_features_give_the_whole_images_bits() {
+    let image = [40, 22];
+    let whole = scene("all", image, 3);
+    let total = whole.total();
+    // Half of the samples lose one component or another; z of the normal is 0 but for a strip at the right.
+    let spoil = |plane: usize, sample: usize| {
+        let hash = (sample * 31 + plane * 7 + 5).wrapping_mul(2_654_435_761) >> 7;
+        let value = whole.value(plane, sample);
+        match plane {
+            5..11 | 14..20 if hash % 8 == 0 => f32::NAN,
+            5..11 | 14..20 if hash % 8 < 3 => 0.0,
+            10 if sample / 3 % 40 < 34 => 0.0,
+            _ => value,
+        }
+    };
+    let planes: Vec<Vec<f32>> = (0..27).map(|p| (0..total).map(|s| spoil(p, s)).collect()).collect();
+    let cut = |geometry: TileGeometry| {
+        let window = geometry.window();
+        let pixels = (window.y..window.bottom()).flat_map(|y| (window.x..window.right()).map(move |x| y * 40 + x));
+        let samples: Vec<usize> = pixels.flat_map(|pixel| whole.samples_of(pixel as usize)).collect();
+        let planes = planes.iter().map(|p| Plane::Values(samples.iter().map(|&s| p[s]).collect()));
+        SampleTile::new(geometry, whole.channels().clone(), Counts::Uniform(3), planes.collect()).unwrap()
+    };
+    for method in methods() {
+        let expected = tiled(image, 100, 0, &method, cut);
+        let tiles = tiled(image, 8, method.reach(false), &method, cut);
+        assert!(bits(&tiles) == bits(&expected), "{method:?}");
+    }
+}
+
+/// Hole filling looks no further than it has to: this would take hours if it did.
+#[test]
+fn an_empty_tile_is_quick_whatever_the_box() {
+    let method = method("lean", &[("boxes", "255"), ("fractions", "0")]);
+    let geometry = TileGeometry::with_halo([512, 512], Rect::new(0, 0, 512, 512), 0).unwrap();
+    let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+    let tile = SampleTile::new(geometry, channels, Counts::Uniform(0), vec![Plane::Constant(0.0); 3]).unwrap();
+    assert_eq!(run(&tile, &method).report.unfilled, 512 * 512);
+}
+
 /// The plainest tiles there are: no film, no features, no random parameters; one or no sample; one pixel.
 #[test]
 fn the_smallest_tiles_filter() {
