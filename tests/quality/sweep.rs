@@ -47,8 +47,8 @@ fn settings(preset: &str) -> Vec<Settings> {
 }
 
 const SPACE: [f64; 3] = [2.0, 3.0, 4.0];
-const COLOR: [f64; 4] = [0.8, 1.6, 3.2, 6.4];
-const FEATURE: [f64; 2] = [0.05, 0.1];
+const COLOR: [f64; 3] = [1.6, 3.2, 6.4];
+const FEATURE: [f64; 3] = [0.025, 0.05, 0.1];
 const DEVIATIONS: [f64; 3] = [0.5, 1.0, 2.0];
 const POSITION: [f64; 3] = [5.0, 10.0, 30.0];
 

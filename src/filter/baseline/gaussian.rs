@@ -5,7 +5,22 @@
 //!
 //! # The sweep that chose the default
 //!
-//! SWEEP
+//! relMSE less the reference's own at 8 samples per pixel, on the five renders of `tests/quality`, and its geometric mean;
+//! without a filter that is 0.103. The defaults are fitted to the very scenes that methods are compared on here, which
+//! flatters them.
+//!
+//! | sigma | mean | cornell_box | depth_of_field | glossy_highlights | motion_blur | textures |
+//! |---|---|---|---|---|---|---|
+//! | 0.3 | 0.0999 | 0.0293 | 0.3868 | 0.1344 | 0.0965 | 0.0678 |
+//! | 0.4 | 0.0849 | 0.0388 | 0.2884 | 0.1012 | 0.0720 | 0.0539 |
+//! | 0.5 | 0.0789 | 0.1337 | 0.1704 | 0.0646 | 0.0423 | 0.0491 |
+//! | 0.6 | 0.0777 | 0.3087 | 0.1101 | 0.0503 | 0.0269 | 0.0616 |
+//! | 0.75 | 0.0822 | 0.5973 | 0.0760 | 0.0522 | 0.0181 | 0.0874 |
+//! | 1 | 0.0976 | 1.0424 | 0.0566 | 0.0882 | 0.0136 | 0.1249 |
+//! | 1.5 | 0.1402 | 1.8368 | 0.0501 | 0.2516 | 0.0130 | 0.1795 |
+//! | 2 | 0.1908 | 2.5389 | 0.0647 | 0.4689 | 0.0152 | 0.2156 |
+//!
+//! Printed by `RPFD_DATA=path/to/renders cargo test --release --test integration baselines_sweep -- --ignored --nocapture`.
 
 use super::window::{Distances, Windowed};
 use crate::filter::lanes::padded;
@@ -24,7 +39,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { sigma: 1.0 }
+        Self { sigma: 0.6 }
     }
 }
 
