@@ -127,10 +127,10 @@ impl Method {
 
     /// Whether it looks at channels of this role.
     pub fn reads(&self, role: &Role) -> bool {
-        match (role, &self.algorithm) {
-            (Role::Color, _) | (_, Algorithm::Rpf(_)) => true,
-            (Role::Feature { .. }, Algorithm::CrossBilateral(_)) => true,
-            _ => false,
+        match &self.algorithm {
+            Algorithm::Rpf(_) => true,
+            Algorithm::CrossBilateral(_) => matches!(role, Role::Color | Role::Feature { .. }),
+            Algorithm::Unfiltered | Algorithm::Gaussian(_) | Algorithm::Bilateral(_) => *role == Role::Color,
         }
     }
 
