@@ -31,6 +31,7 @@ fn measure(
     counts: Counts,
     method: &Method,
     threads: usize,
+    leave_out: bool,
 ) -> (u64, u64) {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
     pool.install(|| ());
@@ -49,7 +50,7 @@ fn measure(
     ALLOCATIONS.reset_peak_usage();
     let planes = planes(&channels, samples as usize);
     let tile = SampleTile::new(geometry, channels.clone(), counts, planes).expect("a valid tile");
-    let execution = Execution { pool: Some(&pool), ..Execution::default() };
+    let execution = Execution { pool: Some(&pool), leave_out, ..Execution::default() };
     let filtered = filter(&tile, method, &execution).expect("nobody stops it");
     assert_eq!(filtered.rgb[0].len() as u64, geometry.core().area());
     (ALLOCATIONS.peak_usage() as u64 - before + given, planned)
@@ -65,6 +66,9 @@ fn plans_are_upper_bounds_and_tight() {
     let methods = [
         Method::preset("lean").expect("a preset"),
         Method::preset("unfiltered").expect("a preset"),
+        Method::with("gaussian", [("sigma", "5")]).expect("valid"),
+        Method::with("bilateral", [("color_scale", "log")]).expect("valid"),
+        Method::preset("cross-bilateral").expect("a preset"),
         Method::with("paper-fast", quick).expect("valid"),
         Method::with("lean", [("information_grid", "1"), ("bins", "31"), ("fractions", "1,1")]).expect("valid"),
     ];
@@ -75,9 +79,9 @@ fn plans_are_upper_bounds_and_tight() {
             (tile(96, 96, 0), channels(0, 0), Counts::Uniform(2)),
             (tile(72, 40, 16), channels(1, 1), Counts::Varying((0..72 * 72).map(|i| (i % 7) as u16).collect())),
         ] {
-            for threads in [1, 3] {
+            for (threads, leave_out) in [(1, true), (3, true), (1, false)] {
                 let planes = channels.planes();
-                let (peak, planned) = measure(geometry, channels.clone(), counts.clone(), method, threads);
+                let (peak, planned) = measure(geometry, channels.clone(), counts.clone(), method, threads, leave_out);
                 let name = format!("{} of {planes} planes on {threads} threads", method.preset_name());
                 assert!(peak <= planned, "{name}: {peak} bytes where {planned} were planned");
                 assert!(planned * 4 <= peak * 5, "{name}: {planned} bytes planned, {peak} needed");

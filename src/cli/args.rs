@@ -2,7 +2,10 @@
 
 use super::failure::Failure;
 use crate::{
-    filter::{Method, ParameterError, method::PRESETS},
+    filter::{
+        Method, ParameterError,
+        method::{Algorithm, PRESETS},
+    },
     stitch::{
         ExrCompression, ExrLayout, ExrOptions, ExrSamples,
         exr::{TILE_SIZES, provenance},
@@ -31,12 +34,23 @@ static PRESET_HELP: LazyLock<String> = LazyLock::new(|| {
 });
 
 static SET_HELP: LazyLock<String> = LazyLock::new(|| {
-    let parameters = Method::default().parameters();
-    let parameters = parameters.iter().map(|(name, value)| format!("\n- {name} ({value})"));
+    let presets = PRESETS.iter().filter_map(|(name, _)| Method::preset(name).ok());
+    // Those that RPF has are listed once, with the default preset's values.
+    let listed = presets
+        .filter(|method| !method.parameters().is_empty())
+        .filter(|method| *method == Method::default() || !matches!(method.algorithm(), Algorithm::Rpf(_)));
+    let listed = listed.map(|method| {
+        let parameters = method.parameters().into_iter().map(|(name, value)| format!("\n- {name} ({value})"));
+        let presets = match method.algorithm() {
+            Algorithm::Rpf(_) => "lean, and other values in paper-fast and paper",
+            _ => method.preset_name(),
+        };
+        format!("\n{presets}:{}", parameters.collect::<String>())
+    });
     format!(
-        "Set one of the preset's parameters; may be given several times, lists with commas (--set boxes=17,7). Every \
-         preset but unfiltered has, with the default preset's values:{}",
-        parameters.collect::<String>()
+        "Set one of the preset's parameters; may be given several times, lists with commas (--set boxes=17,7). There \
+         are, with their values in{}",
+        listed.collect::<String>()
     )
 });
 

@@ -109,6 +109,7 @@ fn mean(args: &Args, input: &Input, path: &Path) -> Result<f64, Failure> {
     let offline = Offline {
         method: Method::preset("unfiltered")?,
         seed: 0,
+        leave_out: true,
         threads: 1,
         pool: None,
         stop: Default::default(),

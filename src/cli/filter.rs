@@ -54,6 +54,9 @@ pub(crate) struct Args {
     temp_dir: Option<PathBuf>,
     #[command(flatten)]
     threads: ThreadArgs,
+    /// Whether what can have no effect is left out, like planes that are constant: off takes longer, for the same file
+    #[arg(long, value_name = "on|off", default_value = "on", value_parser = ["on", "off"])]
+    leave_out: String,
     /// Print what was done as JSON
     #[arg(long)]
     pub(crate) json: bool,
@@ -84,6 +87,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let offline = Offline {
         method,
         seed: args.method.seed,
+        leave_out: args.leave_out == "on",
         threads: args.threads.count(),
         pool: args.threads.pool()?,
         stop: progress::interrupted(),
@@ -141,6 +145,8 @@ fn write_picture(stitcher: &Stitcher, path: &Path) -> Result<(), Failure> {
 pub(crate) struct Offline<'a> {
     pub(crate) method: Method,
     pub(crate) seed: u64,
+    /// Whether what can have no effect is left out.
+    pub(crate) leave_out: bool,
     pub(crate) threads: usize,
     pub(crate) pool: Option<rayon::ThreadPool>,
     pub(crate) stop: Arc<AtomicBool>,
@@ -214,6 +220,7 @@ impl Offline<'_> {
             pool: self.pool.as_ref(),
             stop: Some(&self.stop),
             progress: Some(&advance),
+            leave_out: self.leave_out,
             ..Execution::default()
         };
         let filtered = filter(tile, &self.method, &execution)?;
@@ -286,6 +293,7 @@ impl Run {
             "halo_had": had,
             "halo_needed": sides(totals.halo_needed),
             "short_of_halo": totals.short_of_halo,
+            "leave_out": offline.leave_out,
             "left_out": left_out
                 .map(|((plane, reason), tiles)| json!({ "plane": plane, "reason": reason, "tiles": tiles }))
                 .collect::<Vec<_>>(),

@@ -6,11 +6,7 @@ use super::{
     input::Input,
 };
 use crate::{
-    filter::{
-        Halo, Method, Role,
-        method::{Algorithm, PRESETS},
-        plan::plan,
-    },
+    filter::{Halo, Method, Role, method::PRESETS, plan::plan},
     wire::scan::PlaneSummary,
 };
 use indicatif::HumanBytes;
@@ -145,9 +141,9 @@ const fn role_name(role: Role) -> &'static str {
 /// Why a plane has no effect in any tile, if so; `none` says that no sample has the feature.
 fn left_out(plane: &PlaneSummary, role: Role, none: bool, method: &Method) -> Option<&'static str> {
     let holes = plane.nan + plane.infinite;
-    match (role, method.algorithm()) {
-        (Role::Color, _) => None,
-        (_, Algorithm::Unfiltered) => Some("unused"),
+    match role {
+        Role::Color => None,
+        _ if !method.reads(&role) => Some("unused"),
         _ if none || (plane.finite == 0 && plane.infinite == 0) => Some("missing"),
         _ if plane.min >= plane.max && holes == 0 => Some("constant"),
         _ => None,

@@ -1,6 +1,7 @@
 //! Methods by name: presets and their parameters, set one by one by the same names everywhere (flags, query, JSON).
 
-use super::rpf;
+use super::baseline::{bilateral, cross_bilateral, gaussian};
+use super::{Role, rpf};
 
 /// The preset used when none is named.
 pub const DEFAULT_PRESET: &str = "lean";
@@ -10,6 +11,9 @@ pub const PRESETS: &[(&str, &str)] = &[
     ("lean", "the best of RPF for its cost: two small boxes, information on every 4th pixel"),
     ("paper-fast", "RPF with the report's boxes and few neighbours"),
     ("paper", "RPF as published; ten times the neighbours of paper-fast"),
+    ("cross-bilateral", "a bilateral filter of pixels over distance, colour and features"),
+    ("bilateral", "a bilateral filter of pixels over distance and colour"),
+    ("gaussian", "a Gaussian blur of pixels"),
     ("unfiltered", "the mean of each pixel's samples"),
 ];
 
@@ -55,6 +59,12 @@ pub struct Method {
 pub enum Algorithm {
     /// The mean of each pixel's samples.
     Unfiltered,
+    /// A Gaussian blur of pixels.
+    Gaussian(gaussian::Params),
+    /// A bilateral filter of pixels over distance and colour.
+    Bilateral(bilateral::Params),
+    /// A bilateral filter of pixels over distance, colour and features.
+    CrossBilateral(cross_bilateral::Params),
     /// Random Parameter Filtering.
     Rpf(rpf::Params),
 }
@@ -83,25 +93,20 @@ impl Method {
             "lean" => Algorithm::Rpf(rpf::Params::lean()),
             "paper-fast" => Algorithm::Rpf(rpf::Params::paper_fast()),
             "paper" => Algorithm::Rpf(rpf::Params::paper()),
+            "cross-bilateral" => Algorithm::CrossBilateral(cross_bilateral::Params::default()),
+            "bilateral" => Algorithm::Bilateral(bilateral::Params::default()),
+            "gaussian" => Algorithm::Gaussian(gaussian::Params::default()),
             _ => Algorithm::Unfiltered,
         };
         for (name, value) in settings {
             let (name, value) = (name.as_ref(), value.as_ref());
-            let known = match &mut algorithm {
-                Algorithm::Unfiltered => false,
-                Algorithm::Rpf(params) => params.set(name, value)?,
-            };
-            if !known {
-                let known = match &algorithm {
-                    Algorithm::Unfiltered => "none".to_owned(),
-                    Algorithm::Rpf(params) => params.entries().map(|(name, _)| name).join(", "),
-                };
+            if !algorithm.set(name, value)? {
+                let names: Vec<_> = algorithm.entries().into_iter().map(|(name, _)| name).collect();
+                let known = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
                 return Err(ParameterError::Name { preset, name: name.to_owned(), known });
             }
         }
-        if let Algorithm::Rpf(params) = &algorithm {
-            params.validate()?;
-        }
+        algorithm.validate()?;
         Ok(Self { preset, algorithm })
     }
 
@@ -117,9 +122,15 @@ impl Method {
 
     /// Every parameter and its value in words, as [`Method::with`] reads them.
     pub fn parameters(&self) -> Vec<(&'static str, String)> {
+        self.algorithm.entries()
+    }
+
+    /// Whether it looks at channels of this role.
+    pub fn reads(&self, role: &Role) -> bool {
         match &self.algorithm {
-            Algorithm::Unfiltered => Vec::new(),
-            Algorithm::Rpf(params) => params.entries().to_vec(),
+            Algorithm::Rpf(_) => true,
+            Algorithm::CrossBilateral(_) => matches!(role, Role::Color | Role::Feature { .. }),
+            Algorithm::Unfiltered | Algorithm::Gaussian(_) | Algorithm::Bilateral(_) => *role == Role::Color,
         }
     }
 
@@ -128,7 +139,63 @@ impl Method {
     pub fn reach(&self, varying: bool) -> u32 {
         match &self.algorithm {
             Algorithm::Unfiltered => 0,
+            Algorithm::Gaussian(params) => params.reach(varying),
+            Algorithm::Bilateral(params) => params.gaussian.reach(varying),
+            Algorithm::CrossBilateral(params) => params.bilateral.gaussian.reach(varying),
             Algorithm::Rpf(params) => params.reach(varying),
         }
     }
+}
+
+impl Algorithm {
+    fn set(&mut self, name: &str, value: &str) -> Result<bool, ParameterError> {
+        match self {
+            Self::Unfiltered => Ok(false),
+            Self::Gaussian(params) => params.set(name, value),
+            Self::Bilateral(params) => params.set(name, value),
+            Self::CrossBilateral(params) => params.set(name, value),
+            Self::Rpf(params) => params.set(name, value),
+        }
+    }
+
+    fn entries(&self) -> Vec<(&'static str, String)> {
+        match self {
+            Self::Unfiltered => Vec::new(),
+            Self::Gaussian(params) => params.entries(),
+            Self::Bilateral(params) => params.entries(),
+            Self::CrossBilateral(params) => params.entries(),
+            Self::Rpf(params) => params.entries().to_vec(),
+        }
+    }
+
+    fn validate(&self) -> Result<(), ParameterError> {
+        match self {
+            Self::Unfiltered => Ok(()),
+            Self::Gaussian(params) => params.validate(),
+            Self::Bilateral(params) => params.validate(),
+            Self::CrossBilateral(params) => params.validate(),
+            Self::Rpf(params) => params.validate(),
+        }
+    }
+}
+
+/// What is wrong with a parameter's value.
+pub(super) fn wrong(name: &'static str, value: &str, right: &str) -> ParameterError {
+    ParameterError::Value { name, value: value.to_owned(), right: right.to_owned() }
+}
+
+/// Reads one value; `kind` says of what kind it must be.
+pub(super) fn one<T: std::str::FromStr>(name: &'static str, value: &str, kind: &str) -> Result<T, ParameterError> {
+    value.trim().parse().map_err(|_| wrong(name, value, &format!("must be {kind}")))
+}
+
+/// Checks that a number lies within its range, which NaN never does.
+pub(super) fn within(
+    name: &'static str,
+    value: f64,
+    range: std::ops::RangeInclusive<f64>,
+    unit: &str,
+) -> Result<(), ParameterError> {
+    let right = || format!("must be {} to {} {unit}", range.start(), range.end());
+    if range.contains(&value) { Ok(()) } else { Err(wrong(name, &value.to_string(), &right())) }
 }

@@ -28,6 +28,7 @@
 
 pub mod baseline;
 pub mod coverage;
+mod finish;
 pub mod geometry;
 mod lanes;
 pub mod method;
@@ -35,6 +36,7 @@ pub mod oracle;
 pub mod plan;
 pub mod rpf;
 pub mod samples;
+mod share;
 
 pub use coverage::Coverage;
 pub use geometry::{Halo, Rect, TileGeometry};
@@ -45,7 +47,7 @@ pub use samples::{Channel, ChannelSet, Counts, Plane, Role, SampleTile};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// On what, and under which random seed, the work is done.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy)]
 pub struct Execution<'a> {
     /// Keys every random draw, together with image position and iteration.
     pub seed: u64,
@@ -57,6 +59,15 @@ pub struct Execution<'a> {
     pub simd: SimdLevel,
     /// Called from any thread with the share of the work that is done, 0 to 1, now and then.
     pub progress: Option<&'a (dyn Fn(f32) + Sync)>,
+    /// Whether what can have no effect is left out: planes, columns of a neighbourhood and distances that are constant,
+    /// missing or weigh nothing. On by default; off computes all of it, for the same bits in more time.
+    pub leave_out: bool,
+}
+
+impl Default for Execution<'_> {
+    fn default() -> Self {
+        Self { seed: 0, pool: None, stop: None, simd: SimdLevel::default(), progress: None, leave_out: true }
+    }
 }
 
 impl Execution<'_> {
@@ -153,6 +164,9 @@ impl LeftOutReason {
 pub fn filter(tile: &SampleTile, method: &Method, execution: &Execution) -> Result<Filtered, Stopped> {
     match method.algorithm() {
         method::Algorithm::Unfiltered => baseline::mean::filter(tile, execution),
+        method::Algorithm::Gaussian(params) => baseline::window::filter(tile, params, execution),
+        method::Algorithm::Bilateral(params) => baseline::window::filter(tile, params, execution),
+        method::Algorithm::CrossBilateral(params) => baseline::window::filter(tile, params, execution),
         method::Algorithm::Rpf(params) => rpf::filter(tile, params, execution),
     }
 }

@@ -52,6 +52,9 @@ pub fn plan(shape: &Shape, method: &Method) -> Plan {
     let output = shape.geometry.core().area() * 12 + FIXED + 2 * names;
     let own = match method.algorithm() {
         Algorithm::Unfiltered => Plan::default(),
+        Algorithm::Gaussian(params) => super::baseline::window::plan(shape, params),
+        Algorithm::Bilateral(params) => super::baseline::window::plan(shape, params),
+        Algorithm::CrossBilateral(params) => super::baseline::window::plan(shape, params),
         Algorithm::Rpf(params) => super::rpf::plan(shape, params),
     };
     Plan { samples, output, ..own }

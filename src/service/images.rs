@@ -95,6 +95,8 @@ pub(super) struct Image {
     size: [u32; 2],
     pub(super) method: Arc<Method>,
     pub(super) seed: u64,
+    /// Whether what can have no effect is left out; the same image either way.
+    pub(super) leave_out: bool,
     /// The channels of its tiles: those of the first that came whole.
     channels: OnceLock<ChannelSet>,
     canvas: RwLock<Canvas>,
@@ -311,6 +313,7 @@ fn described(body: &[u8], config: &Config) -> Result<Image, Refusal> {
     };
     let size: [u32; 2] = [side("width")?, side("height")?];
     let id = parameters.take("id").map_or_else(|| Ok(Id::new()), Id::chosen)?;
+    let leave_out = parameters.leave_out()?;
     let (method, seed) = parameters.method()?;
     let (pixels, most) = (u64::from(size[0]) * u64::from(size[1]), config.image_pixels);
     if pixels > most {
@@ -320,7 +323,7 @@ fn described(body: &[u8], config: &Config) -> Result<Image, Refusal> {
     }
     let stitcher = Stitcher::new(size[0], size[1], &config.data_dir)?;
     let canvas = RwLock::new(Canvas { stitcher, seconds: HashMap::new() });
-    Ok(Image { id, size, method: Arc::new(method), seed, channels: OnceLock::new(), canvas })
+    Ok(Image { id, size, method: Arc::new(method), seed, leave_out, channels: OnceLock::new(), canvas })
 }
 
 /// `POST /v1/images`.

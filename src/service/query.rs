@@ -90,6 +90,12 @@ impl Parameters {
         Ok(self.choice(name, &choices)?.unwrap_or(false))
     }
 
+    /// Takes out whether what can have no effect is left out; absent means yes.
+    pub(super) fn leave_out(&mut self) -> Result<bool, Refusal> {
+        let choices = [("on", true), ("true", true), ("off", false), ("false", false)];
+        Ok(self.choice("leave_out", &choices)?.unwrap_or(true))
+    }
+
     /// Takes out everything that is left: preset, seed, and the preset's parameters.
     pub(super) fn method(mut self) -> Result<(Method, u64), Refusal> {
         let preset = self.take("preset").unwrap_or_else(|| DEFAULT_PRESET.to_owned());
@@ -221,6 +227,14 @@ mod tests {
         assert_eq!(of_query.1, 7);
         assert_eq!(query("boxes=9%2C5&spikes=off&bins=9").unwrap().method().unwrap().0, of_query.0);
         assert_eq!(query("").unwrap().method().unwrap(), (Method::default(), 0));
+    }
+
+    #[test]
+    fn leaving_out_is_on_unless_it_is_off() {
+        let leave_out = |text: &str| query(text).and_then(|mut parameters| parameters.leave_out());
+        assert!(leave_out("").unwrap() && leave_out("leave_out=on").unwrap() && !leave_out("leave_out=off").unwrap());
+        assert_eq!(code(leave_out("leave_out=maybe")), "bad_parameter");
+        assert!(!Parameters::of_json(br#"{"leave_out": false}"#).unwrap().leave_out().unwrap());
     }
 
     #[test]

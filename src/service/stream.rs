@@ -45,6 +45,8 @@ pub(super) struct Call {
     pub(super) service: Shared,
     pub(super) method: Arc<Method>,
     pub(super) seed: u64,
+    /// Whether what can have no effect is left out.
+    leave_out: bool,
     pub(super) target: Target,
     /// Tiles of this request that are being worked on.
     busy: watch::Sender<usize>,
@@ -69,8 +71,8 @@ struct Done {
 }
 
 impl Call {
-    fn new(service: Shared, method: Arc<Method>, seed: u64, target: Target) -> Self {
-        Self { service, method, seed, target, busy: watch::Sender::new(0) }
+    fn new(service: Shared, method: Arc<Method>, seed: u64, leave_out: bool, target: Target) -> Self {
+        Self { service, method, seed, leave_out, target, busy: watch::Sender::new(0) }
     }
 
     /// Waits until none of this request's tiles is being worked on.
@@ -90,7 +92,13 @@ impl Call {
     /// Filters a tile; its samples, and the memory they took, are free afterwards. `None`: it was stopped.
     fn filter(&self, tile: SampleTile, mut held: Held, pool: &ThreadPool, stop: &AtomicBool) -> Option<(Done, Held)> {
         let started = Instant::now();
-        let execution = Execution { seed: self.seed, pool: Some(pool), stop: Some(stop), ..Execution::default() };
+        let execution = Execution {
+            seed: self.seed,
+            pool: Some(pool),
+            stop: Some(stop),
+            leave_out: self.leave_out,
+            ..Execution::default()
+        };
         let filtered = filter(&tile, &self.method, &execution).ok()?;
         drop(tile);
         held.permit.shrink_to(held.output);
@@ -194,8 +202,10 @@ fn log(written: Result<io::Result<()>, Refusal>) {
 /// `POST /v1/filter`.
 pub(super) async fn filter_stream(State(service): State<Shared>, request: Request) -> Result<Response, Refusal> {
     let form = Form::accepted(request.headers())?;
-    let (method, seed) = Parameters::of_query(request.uri())?.method()?;
-    let call = Call::new(service, Arc::new(method), seed, Target::Client);
+    let mut parameters = Parameters::of_query(request.uri())?;
+    let leave_out = parameters.leave_out()?;
+    let (method, seed) = parameters.method()?;
+    let call = Call::new(service, Arc::new(method), seed, leave_out, Target::Client);
     match form {
         Form::Messages => answer(call, request, form.media()).await,
         Form::Exr | Form::Png => single(call, request, form).await,
@@ -208,8 +218,8 @@ pub(super) async fn image_tiles(State(service): State<Shared>, id: Id, request: 
     let mut parameters = Parameters::of_query(request.uri())?;
     let replace = parameters.flag("replace")?;
     parameters.done("replace")?;
-    let (method, seed) = (Arc::clone(&image.method), image.seed);
-    let call = Call::new(service, method, seed, Target::Image { image, replace });
+    let (method, seed, leave_out) = (Arc::clone(&image.method), image.seed, image.leave_out);
+    let call = Call::new(service, method, seed, leave_out, Target::Image { image, replace });
     answer(call, request, "application/x-ndjson").await
 }
 

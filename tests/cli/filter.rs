@@ -17,6 +17,10 @@ fn the_default_preset_denoises() {
     let left_out: Vec<_> =
         report["left_out"].as_array().unwrap().iter().map(|l| l["plane"].as_str().unwrap()).collect();
     assert_eq!(left_out, ["lens.0", "lens.1"]);
+    let all = folder.path("all.exr");
+    let report = json(["filter", input, "-o", &all, "--leave-out", "off"]);
+    assert_eq!((&report["leave_out"], &report["left_out"]), (&false.into(), &Value::Array(Vec::new())));
+    assert!(bytes(&all) == bytes(&out));
     assert!(bytes(&png).starts_with(b"\x89PNG"));
 
     let plain = folder.path("plain.exr");
@@ -24,7 +28,7 @@ fn the_default_preset_denoises() {
     let reference = read_exr(data("small.reference.exr"));
     let error = |path: &str| errors(&read_exr(path).pixels, &reference.pixels).unwrap().relmse;
     assert!(error(&out) < 0.5 * error(&plain), "{} against {}", error(&out), error(&plain));
-    assert_eq!(folder.names(), ["out.exr", "out.png", "plain.exr"]);
+    assert_eq!(folder.names(), ["all.exr", "out.exr", "out.png", "plain.exr"]);
 }
 
 /// Bare cores, tiles with halo, one huge tile, shuffled tiles, memory that is plenty or scarce, one thread or two.

@@ -8,6 +8,9 @@ use rpfd::store::Spool;
 use rpfd::wire::file::TileFile;
 use std::path::{Path, PathBuf};
 
+mod leave_out;
+mod sweep;
+
 const SCENES: [&str; 5] = ["cornell_box", "depth_of_field", "glossy_highlights", "motion_blur", "textures"];
 
 /// The folder with further data, if there is one.
@@ -33,19 +36,25 @@ fn whole(path: &Path) -> SampleTile {
     spool.cut(TileGeometry::with_halo([width, height], Rect::new(0, 0, width, height), 0).unwrap()).unwrap()
 }
 
-/// relMSE of a method on a render, less the reference's own, and CPU seconds per megapixel on one thread.
-fn relmse(folder: &Path, scene: &str, spp: u32, method: &Method) -> (f64, f64) {
+/// A render as one tile, its reference's pixels, and the reference's own relMSE.
+fn loaded(folder: &Path, scene: &str, spp: u32) -> (SampleTile, Vec<[f32; 3]>, f64) {
     let tile = whole(&folder.join(format!("{scene}.{spp}spp.tiles.zst")));
     let reference = exr::read(&folder.join(format!("{scene}.reference.exr")), 1 << 24).unwrap();
     let noise: serde_json::Value =
         serde_json::from_slice(&std::fs::read(folder.join("reference-noise.json")).unwrap()).unwrap();
     let own = noise[scene]["relmse"].as_f64().unwrap_or_else(|| panic!("no noise of {scene} in {noise}"));
+    (tile, reference.pixels, own)
+}
+
+/// relMSE of a method on a render, less the reference's own, and CPU seconds per megapixel on one thread.
+fn relmse(folder: &Path, scene: &str, spp: u32, method: &Method) -> (f64, f64) {
+    let (tile, reference, own) = loaded(folder, scene, spp);
     let start = std::time::Instant::now();
     let filtered = filter(&tile, method, &Execution::default()).unwrap();
     let seconds = start.elapsed().as_secs_f64() * 1e6 / tile.geometry().core().area() as f64;
     let [r, g, b] = &filtered.rgb;
     let pixels: Vec<[f32; 3]> = r.iter().zip(g).zip(b).map(|((&r, &g), &b)| [r, g, b]).collect();
-    let errors = errors(&pixels, &reference.pixels).unwrap();
+    let errors = errors(&pixels, &reference).unwrap();
     assert_eq!(errors.nonfinite, 0);
     (errors.relmse - own, seconds)
 }

@@ -38,6 +38,8 @@ pub(crate) struct Histograms {
     bins: usize,
     rows: usize,
     words: usize,
+    /// Whether constant columns are passed over.
+    leave_out: bool,
     /// Bit masks, `[column][bin][word]`, with `words` words each.
     masks: Vec<u64>,
     histograms: Vec<Histogram>,
@@ -45,12 +47,13 @@ pub(crate) struct Histograms {
 
 impl Histograms {
     /// Room for so many columns and rows.
-    pub(crate) fn with_capacity(columns: usize, rows: usize, bins: u32) -> Self {
+    pub(crate) fn with_capacity(columns: usize, rows: usize, bins: u32, leave_out: bool) -> Self {
         let bins = bins as usize;
         Self {
             bins,
             rows: 0,
             words: 0,
+            leave_out,
             masks: vec![0; columns * bins * mask_words(rows)],
             histograms: vec![Histogram { counts: [0; MAX_BINS as usize], terms: 0.0, constant: true }; columns],
         }
@@ -72,7 +75,7 @@ impl Histograms {
     pub(crate) fn set<S: Simd>(&mut self, simd: S, column: usize, values: &[f32], constant: bool, terms: &[f64]) {
         let histogram = &mut self.histograms[column];
         histogram.constant = constant;
-        if constant {
+        if constant && self.leave_out {
             return;
         }
         let (bins, words) = (self.bins, self.words);
@@ -102,7 +105,8 @@ impl Histograms {
     #[inline(always)]
     pub(crate) fn information(&self, x: usize, y: usize, terms: &[f64]) -> f64 {
         let (of_x, of_y) = (&self.histograms[x], &self.histograms[y]);
-        if of_x.constant || of_y.constant {
+        let constant = of_x.constant || of_y.constant;
+        if constant && self.leave_out {
             return 0.0;
         }
         let (bins, words) = (self.bins, self.words);
@@ -131,6 +135,8 @@ impl Histograms {
         for &left in &left_y[..bins] {
             joint += terms[left as usize];
         }
-        ((joint - of_x.terms - of_y.terms + terms[self.rows]) / self.rows as f64).max(0.0)
+        let information = ((joint - of_x.terms - of_y.terms + terms[self.rows]) / self.rows as f64).max(0.0);
+        // By definition, whatever rounding has left.
+        if constant { 0.0 } else { information }
     }
 }

@@ -61,7 +61,7 @@ impl ColumnOrder {
 
 impl Scratch {
     /// Room for neighbourhoods of so many rows.
-    pub(crate) fn new(relevant: &Relevant, rows: usize, bins: u32) -> Self {
+    pub(crate) fn new(relevant: &Relevant, rows: usize, bins: u32, leave_out: bool) -> Self {
         let columns = ColumnOrder::of(relevant).end;
         let stride = padded(rows);
         Self {
@@ -69,7 +69,7 @@ impl Scratch {
             columns: vec![0.0; columns * stride],
             radiance: vec![0.0; 3 * stride],
             stride,
-            histograms: Histograms::with_capacity(columns, stride, bins),
+            histograms: Histograms::with_capacity(columns, stride, bins, leave_out),
             dependencies: Dependencies::new(relevant.features().len()),
             weights: Weights::new(relevant.features().len()),
             active: Vec::with_capacity(columns),
@@ -255,10 +255,12 @@ impl Pass<'_> {
         let rows = scratch.rows.samples.len();
         let steepness = steepness(scratch.weights.confidence, self.params.sigma8_squared, out.len() / 3);
         let factor = |weight: f32| (0.5 * steepness * f64::from(weight)).sqrt() as f32;
+        // A difference that weighs nothing adds 0.
+        let counts = |factor: f32| factor > 0.0 || !self.execution.leave_out;
         scratch.active.clear();
         for feature in 0..self.relevant.features().len() {
             let factor = factor(scratch.weights.features[feature]);
-            if factor > 0.0 {
+            if counts(factor) {
                 let column = order.features + feature;
                 if interpolated {
                     let feature = self.relevant.features()[feature];
@@ -270,7 +272,7 @@ impl Pass<'_> {
         }
         for (channel, span) in spans.iter().enumerate() {
             let factor = factor(scratch.weights.color[channel]);
-            if factor > 0.0 {
+            if counts(factor) {
                 let column = order.colors + channel;
                 if interpolated {
                     self.load_color(simd, scratch, column, channel, span);

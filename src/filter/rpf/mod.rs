@@ -27,13 +27,14 @@ mod tests;
 
 pub use params::Params;
 
+use super::finish::finish;
 use super::lanes::dispatch;
 use super::plan::{Plan, Shape};
+use super::share::share_out;
 use super::{Execution, Filtered, Plane, Rect, Report, SampleTile, Stopped, TileGeometry};
 use grid::Grid;
 use iteration::{Pass, Scratch};
 use relevance::Relevant;
-use std::sync::Mutex;
 
 /// Rows of pixels that a thread takes at a time.
 const BAND: u32 = 8;
@@ -69,12 +70,12 @@ fn most_rows(params: &Params, max_per_pixel: usize) -> usize {
 
 /// Filters a tile.
 pub(super) fn filter(tile: &SampleTile, params: &Params, execution: &Execution) -> Result<Filtered, Stopped> {
-    let relevant = Relevant::of(tile);
+    let relevant = Relevant::of(tile, execution.leave_out);
     let rows = most_rows(params, tile.max_per_pixel() as usize);
     let terms = information::entropy_terms(rows);
     let threads = execution.threads();
     let mut scratches = Vec::with_capacity(threads);
-    scratches.resize_with(threads, || Scratch::new(&relevant, rows, params.bins));
+    scratches.resize_with(threads, || Scratch::new(&relevant, rows, params.bins, execution.leave_out));
     let mut colors = interleaved_colors(tile);
     let mut next = vec![0.0; colors.len()];
     let iterations = params.boxes.len();
@@ -101,7 +102,7 @@ pub(super) fn filter(tile: &SampleTile, params: &Params, execution: &Execution) 
         left_out: relevant.left_out,
         ..Report::default()
     };
-    finish(tile, &colors, params.fill_reach(), report, execution)
+    finish(tile, |x, y| pixel_mean(tile, &colors, x, y), params.fill_reach(), report, execution)
 }
 
 /// The colours of all samples, R, G, B next to each other.
@@ -145,98 +146,10 @@ fn run(pass: &Pass, region: &Rect, scratches: &mut [Scratch], next: &mut [f32]) 
     });
 }
 
-/// Works through the items, each thread with its own scratch, each taking the next item when it is done with one.
-fn share_out<T: Send>(
-    execution: &Execution,
-    scratches: &mut [Scratch],
-    items: impl Iterator<Item = T> + Send,
-    work: impl Fn(&mut Scratch, T) + Sync,
-) {
-    match execution.pool {
-        Some(pool) => {
-            let items = Mutex::new(items);
-            let next = || items.lock().ok().and_then(|mut items| items.next());
-            pool.scope(|scope| {
-                for scratch in scratches {
-                    scope.spawn(|_| {
-                        while let Some(item) = next() {
-                            work(scratch, item);
-                        }
-                    });
-                }
-            });
-        }
-        None => {
-            if let Some(scratch) = scratches.first_mut() {
-                items.for_each(|item| work(scratch, item));
-            }
-        }
-    }
-}
-
-/// The mean of each core pixel's samples; pixels without any are filled from those around them.
-fn finish(
-    tile: &SampleTile,
-    colors: &[f32],
-    fill_reach: u32,
-    mut report: Report,
-    execution: &Execution,
-) -> Result<Filtered, Stopped> {
-    let (core, window) = (tile.geometry().core(), tile.geometry().window());
-    let planes = tile.channels().color_planes();
-    let mut rgb = [(); 3].map(|()| Vec::with_capacity(core.area() as usize));
-    for y in core.y..core.bottom() {
-        for x in core.x..core.right() {
-            if execution.stopped() {
-                return Err(Stopped);
-            }
-            let samples = tile.samples_of(window.index(x, y));
-            report.samples += samples.len() as u64;
-            for plane in planes {
-                report.energy_in += super::baseline::mean::mean(samples.clone().map(|s| tile.value(plane, s)));
-            }
-            let pixel = pixel_mean(tile, colors, x, y).or_else(|| {
-                let filled = fill(tile, colors, x, y, fill_reach);
-                *if filled.is_some() { &mut report.filled } else { &mut report.unfilled } += 1;
-                filled
-            });
-            for (value, plane) in pixel.unwrap_or([0.0; 3]).into_iter().zip(&mut rgb) {
-                report.energy_out += value;
-                plane.push(value as f32);
-            }
-        }
-    }
-    Ok(Filtered { core, rgb, report })
-}
-
 /// Mean of a pixel's filtered samples; none if it has no samples.
 fn pixel_mean(tile: &SampleTile, colors: &[f32], x: u32, y: u32) -> Option<[f64; 3]> {
     let samples = tile.samples_of(tile.geometry().window().index(x, y));
     let count = samples.len() as f64;
     (count > 0.0)
         .then(|| std::array::from_fn(|k| samples.clone().map(|s| f64::from(colors[3 * s + k])).sum::<f64>() / count))
-}
-
-/// Mean of the filtered pixels in the smallest window around a pixel that has any.
-fn fill(tile: &SampleTile, colors: &[f32], x: u32, y: u32, reach: u32) -> Option<[f64; 3]> {
-    if tile.total() == 0 {
-        return None;
-    }
-    let window = tile.geometry().window();
-    (1..=reach).find_map(|radius| {
-        let around = Rect::new(x, y, 1, 1).grown(radius, &window);
-        let (mut sum, mut count) = ([0.0; 3], 0.0);
-        let across = around.x..around.right();
-        for row in around.y..around.bottom() {
-            // Nearer pixels have no samples, else a smaller window would have done: only the ring is new.
-            let edge = row.abs_diff(y) == radius;
-            let sides = [x.wrapping_sub(radius), x + radius].into_iter().filter(|side| !edge && across.contains(side));
-            let ring = if edge { across.clone() } else { 0..0 }.chain(sides);
-            for mean in ring.filter_map(|x| pixel_mean(tile, colors, x, row)) {
-                sum = std::array::from_fn(|k| sum[k] + mean[k]);
-                count += 1.0;
-            }
-        }
-        (count > 0.0).then(|| sum.map(|s| s / count))
-    })
 }

@@ -155,10 +155,18 @@ pub(crate) fn gather_rows(
     }
     // One feature at a time, so that each pass reads one plane and the survivors shrink.
     for feature in relevant.features() {
-        let Plane::Values(values) = tile.plane(feature.plane) else { continue };
         let deviations = if feature.position { clustering.position } else { clustering.feature };
-        let cluster = cluster(&values[own.clone()], deviations, clustering.floor);
-        keep_cluster(rows, own_count, values, &cluster);
+        match tile.plane(feature.plane) {
+            Plane::Values(values) => {
+                let cluster = cluster(&values[own.clone()], deviations, clustering.floor);
+                keep_cluster(rows, own_count, |sample| values[sample as usize], &cluster);
+            }
+            // Here only if nothing is to be left out: this rejects no row.
+            Plane::Constant(value) => {
+                let cluster = cluster(&[*value], deviations, clustering.floor);
+                keep_cluster(rows, own_count, |_| *value, &cluster);
+            }
+        }
     }
 }
 
@@ -202,11 +210,11 @@ fn cluster(own: &[f32], deviations: f64, floor: f64) -> Cluster {
 }
 
 /// Keeps the own rows, and of the others those inside the cluster.
-fn keep_cluster(rows: &mut Rows, own: usize, values: &[f32], cluster: &Cluster) {
+fn keep_cluster(rows: &mut Rows, own: usize, value: impl Fn(u32) -> f32, cluster: &Cluster) {
     let Rows { samples, pixels } = rows;
     let mut kept = own;
     for row in own..samples.len() {
-        let value = values[samples[row] as usize];
+        let value = value(samples[row]);
         let inside = (value - cluster.mean).abs() <= cluster.threshold || (cluster.missing && value.is_nan());
         samples[kept] = samples[row];
         pixels[kept] = pixels[row];

@@ -1,6 +1,6 @@
 //! The parameters of RPF, their ranges, and the presets' values.
 
-use crate::filter::method::ParameterError;
+use crate::filter::method::{ParameterError, one, wrong};
 
 /// Most iterations.
 pub const MAX_ITERATIONS: usize = 8;
@@ -160,14 +160,6 @@ impl Params {
         let wanted = (self.fractions[t] * area * samples as f64).min(f64::from(self.max_neighbors));
         (wanted as usize).max(samples)
     }
-}
-
-fn wrong(name: &'static str, value: &str, right: &str) -> ParameterError {
-    ParameterError::Value { name, value: value.to_owned(), right: right.to_owned() }
-}
-
-fn one<T: std::str::FromStr>(name: &'static str, value: &str, kind: &str) -> Result<T, ParameterError> {
-    value.trim().parse().map_err(|_| wrong(name, value, &format!("must be {kind}")))
 }
 
 fn list<T: std::str::FromStr>(name: &'static str, value: &str, kind: &str) -> Result<Vec<T>, ParameterError> {

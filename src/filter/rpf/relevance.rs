@@ -36,13 +36,13 @@ pub(crate) struct Relevant {
 }
 
 impl Relevant {
-    /// Looks at each plane of a tile. Colours always stay: they are what is filtered.
-    pub(crate) fn of(tile: &SampleTile) -> Self {
+    /// Looks at each plane of a tile. Colours always stay: they are what is filtered. Without `leave_out` all stay.
+    pub(crate) fn of(tile: &SampleTile, leave_out: bool) -> Self {
         let mut found = Self { positions: Vec::new(), random: Vec::new(), features: Vec::new(), left_out: Vec::new() };
         let mut film = false;
         for (plane, (channel, _)) in tile.channels().plane_channels().enumerate() {
             film |= channel.role == Role::Film;
-            if let (Plane::Constant(value), true) = (tile.plane(plane), channel.role != Role::Color) {
+            if let (Plane::Constant(value), true) = (tile.plane(plane), leave_out && channel.role != Role::Color) {
                 let reason = if value.is_nan() { LeftOutReason::Missing } else { LeftOutReason::Constant };
                 found.left_out.push(LeftOut { plane: tile.channels().plane_name(plane), reason });
                 continue;
@@ -51,7 +51,10 @@ impl Relevant {
                 Role::Film => found.positions.push(Source::Plane(plane)),
                 Role::Color => {}
                 Role::Feature { position } => {
-                    let missing = matches!(tile.plane(plane), Plane::Values(v) if v.iter().any(|v| v.is_nan()));
+                    let missing = match tile.plane(plane) {
+                        Plane::Constant(value) => value.is_nan(),
+                        Plane::Values(values) => values.iter().any(|v| v.is_nan()),
+                    };
                     found.features.push(Feature { plane, position, missing });
                 }
                 Role::Random { .. } => found.random.push(plane),

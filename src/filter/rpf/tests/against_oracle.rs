@@ -51,10 +51,10 @@ fn params(preset: &str, settings: &[(&str, &str)]) -> Params {
 
 /// Runs `compare` at some pixels of a noisy scene, in each iteration, with all that a pass has.
 fn at_pixels(params: &Params, tile: &SampleTile, mut compare: impl FnMut(&Pass, &mut Scratch, u32, u32)) {
-    let relevant = Relevant::of(tile);
+    let relevant = Relevant::of(tile, true);
     let rows = most_rows(params, tile.max_per_pixel() as usize);
     let (terms, colors) = (information::entropy_terms(rows), interleaved_colors(tile));
-    let mut scratch = Scratch::new(&relevant, rows, params.bins);
+    let mut scratch = Scratch::new(&relevant, rows, params.bins, true);
     for t in 0..params.boxes.len() {
         let offsets = Offsets::new(params.boxes[t]);
         let execution = Execution { seed: 3, ..Execution::default() };
@@ -283,7 +283,7 @@ fn spikes_agree() {
 /// All of RPF by the oracle's steps: only the random draws are the fast path's.
 fn oracle_image(tile: &SampleTile, params: &Params, seed: u64) -> Vec<[f64; 3]> {
     let window = tile.geometry().window();
-    let relevant = Relevant::of(tile);
+    let relevant = Relevant::of(tile, true);
     let mut colors: Vec<[f64; 3]> =
         interleaved_colors(tile).chunks_exact(3).map(|c| std::array::from_fn(|k| f64::from(c[k]))).collect();
     let plane =

@@ -2,10 +2,10 @@
 
 use super::{method, part, scene};
 use crate::filter::geometry::tiling;
-use crate::filter::method::PRESETS;
+use crate::filter::method::{Algorithm, PRESETS};
 use crate::filter::{
-    Channel, ChannelSet, Counts, Execution, Filtered, Halo, LeftOutReason, Method, Plane, Rect, Role, SampleTile,
-    SimdLevel, Stopped, TileGeometry, filter,
+    Channel, ChannelSet, Counts, Execution, Filtered, Halo, LeftOut, LeftOutReason, Method, Plane, Rect, Role,
+    SampleTile, SimdLevel, Stopped, TileGeometry, filter,
 };
 use crate::synth::Scene;
 use std::sync::atomic::AtomicBool;
@@ -15,13 +15,17 @@ fn run(tile: &SampleTile, method: &Method) -> Filtered {
 }
 
 /// The methods that tiling and threads are tried with: presets as they are where their reach fits a small image, else
-/// with smaller boxes.
-fn methods() -> [Method; 3] {
+/// with smaller boxes; and the baselines.
+fn methods() -> [Method; 7] {
     let small = [("boxes", "15,9,7,5"), ("fractions", "0.05,0.1,0.3,0.5")];
     [
         method("lean", &[]),
         method("paper-fast", &small),
         method("paper-fast", &[small[0], small[1], ("spikes", "off"), ("information_grid", "3")]),
+        method("gaussian", &[("sigma", "2.5")]),
+        method("bilateral", &[("sigma", "3"), ("color_scale", "linear")]),
+        method("bilateral", &[("color_scale", "log"), ("color_sigma", "0.3")]),
+        method("cross-bilateral", &[("sigma", "2"), ("position_deviations", "20")]),
     ]
 }
 
@@ -154,11 +158,59 @@ fn planes_without_effect_change_no_bit() {
     for method in methods() {
         let (plain, extended) = (run(&tile, &method), run(&extended, &method));
         assert_eq!(plain.rgb, extended.rgb);
-        let reason = |name: &str| extended.report.left_out.iter().find(|l| l.plane == name).map(|l| l.reason);
-        assert_eq!(reason("depth"), Some(LeftOutReason::Constant));
-        assert_eq!(reason("P3"), Some(LeftOutReason::Missing));
-        assert_eq!(reason("wavelength"), Some(LeftOutReason::Constant));
-        assert_eq!(reason("time"), Some(LeftOutReason::Constant));
+        for (plane, role, reason) in [
+            ("depth", Role::Feature { position: false }, LeftOutReason::Constant),
+            ("P3", Role::Feature { position: true }, LeftOutReason::Missing),
+            ("wavelength", Role::Random { uniform: true }, LeftOutReason::Constant),
+            ("time", Role::Random { uniform: true }, LeftOutReason::Constant),
+        ] {
+            let said = extended.report.left_out.iter().find(|l| l.plane == plane).map(|l| l.reason);
+            assert_eq!(said, Some(if method.reads(&role) { reason } else { LeftOutReason::Unused }), "{plane}");
+        }
+    }
+}
+
+/// Computing what can have no effect changes no bit: constant and missing planes of every role, columns that are constant
+/// over a neighbourhood only, features and colours that weigh nothing. Random planes come and go, and so do threads.
+#[test]
+fn leaving_out_changes_no_bit() {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+    let hash = |i: u64| (i.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as u32;
+    for (case, name) in ["plain", "lens", "all", "glossy"].into_iter().enumerate() {
+        let noisy = scene(name, [26, 22], 3);
+        let mut channels = noisy.channels().channels().to_vec();
+        let mut planes: Vec<_> = (0..noisy.channels().planes()).map(|p| noisy.plane(p).clone()).collect();
+        // Planes that were there lose what they say: a value, nothing, or a step that few neighbourhoods see.
+        for (i, plane) in planes.iter_mut().enumerate() {
+            let total = noisy.total();
+            match (hash((case * 100 + i) as u64) % 8, noisy.channels().color_planes().contains(&i)) {
+                (0, _) => *plane = Plane::Constant(0.7),
+                (1, false) => *plane = Plane::Constant(f32::NAN),
+                (2, _) => *plane = Plane::Values((0..total).map(|s| f32::from(s > total * 2 / 3)).collect()),
+                _ => {}
+            }
+        }
+        for extra in 0..hash(case as u64) % 4 {
+            let feature = Role::Feature { position: extra % 2 == 0 };
+            let role = if extra < 2 { feature } else { Role::Random { uniform: true } };
+            channels.push(Channel::new(format!("extra{extra}"), role, 1));
+            planes.push(Plane::Constant([f32::NAN, -1e30, 0.0, 3.5][extra as usize]));
+        }
+        let channels = ChannelSet::new(channels).unwrap();
+        let tile = SampleTile::new(*noisy.geometry(), channels, Counts::Uniform(3), planes).unwrap();
+        for method in methods() {
+            let on = run(&tile, &method);
+            for pool in [None, Some(&pool)] {
+                let execution = Execution { seed: 5, pool, leave_out: false, ..Execution::default() };
+                let off = filter(&tile, &method, &execution).unwrap();
+                assert!(on.rgb.iter().zip(&off.rgb).all(|(on, off)| bits(on) == bits(off)), "{name}, {method:?}");
+                assert_eq!(on.report.spikes, off.report.spikes);
+                let unused = |l: &LeftOut| l.reason == LeftOutReason::Unused;
+                assert!(off.report.left_out.iter().all(unused), "{:?}", off.report.left_out);
+                let constant = |r: &Filtered| r.report.left_out.iter().any(|l| !unused(l));
+                assert!(!constant(&off) && (constant(&on) || !matches!(method.algorithm(), Algorithm::Rpf(_))));
+            }
+        }
     }
 }
 
@@ -223,7 +275,7 @@ fn partly_missing_features_give_the_whole_images_bits() {
         let hash = (sample * 31 + plane * 7 + 5).wrapping_mul(2_654_435_761) >> 7;
         let value = whole.value(plane, sample);
         match plane {
-            5..11 | 14..20 if hash % 8 == 0 => f32::NAN,
+            5..11 | 14..20 if hash.is_multiple_of(8) => f32::NAN,
             5..11 | 14..20 if hash % 8 < 3 => 0.0,
             10 if sample / 3 % 40 < 34 => 0.0,
             _ => value,

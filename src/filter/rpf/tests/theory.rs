@@ -18,7 +18,7 @@ fn information(x: &[f32], y: &[f32]) -> f64 {
     let n = x.len();
     let terms = entropy_terms(n);
     dispatch!(SimdLevel::default().level(), simd => {
-        let mut histograms = Histograms::with_capacity(2, padded(n), BINS);
+        let mut histograms = Histograms::with_capacity(2, padded(n), BINS, true);
         histograms.start(n);
         for (column, values) in [x, y].into_iter().enumerate() {
             let mut values = values.to_vec();
