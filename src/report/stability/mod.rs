@@ -4,7 +4,8 @@
 //!
 //! - **Finite**: always.
 //! - **Steps**: each iteration against the oracle's, from the same rounded colours and the same draws. The deviation of a
-//!   sample is relative to the mean absolute colour that is filtered into its pixel. The steps are discontinuous (a
+//!   sample is relative to the mean absolute colour that is filtered into its pixel; differences of f32's least step,
+//!   1.4e-45, are none. The steps are discontinuous (a
 //!   value falls into one bin or the next, a candidate is in or out, a sample is a spike or not); where the oracle saw such
 //!   a decision within f32's error of its threshold *and* the deviation is beyond the bound, the pixel is counted as
 //!   decided differently, with its own greatest deviation, and the count has a bound.

@@ -36,14 +36,16 @@ pub(super) struct Samples {
 impl Base {
     /// The samples.
     pub(super) fn samples(self) -> Samples {
-        let (size, spp) = match self {
-            Self::Image | Self::NoFeatures => ([16, 16], 4),
-            Self::OneSample => ([16, 16], 1),
-            Self::ManySamples => ([2, 2], 1024),
-            Self::Small => ([6, 6], 4),
-            Self::Size(width, height) => ([width, height], 4),
+        // Sky, a ball in motion and the edge of another before it, and the floor.
+        let corner = [16, 14];
+        let (corner, size, spp) = match self {
+            Self::Image | Self::NoFeatures => (corner, [16, 16], 4),
+            Self::OneSample => (corner, [16, 16], 1),
+            Self::ManySamples => ([20, 26], [2, 2], 1024),
+            Self::Small => ([20, 18], [6, 6], 4),
+            Self::Size(width, height) => (corner, [width, height], 4),
         };
-        let mut samples = Samples::render(size, spp);
+        let mut samples = Samples::render(corner, size, spp);
         // Second hits are features like any others: without them the oracle is done sooner.
         samples.keep(|channel| !matches!(channel.name.as_str(), "P2" | "N2"));
         if self == Self::NoFeatures {
@@ -54,9 +56,9 @@ impl Base {
 }
 
 impl Samples {
-    /// Part of a render of 64 x 64 pixels: a textured ball's edge before the floor.
-    fn render([width, height]: [u32; 2], spp: u32) -> Self {
-        let core = Rect::new(20, 26, width, height);
+    /// Part of a render of 64 x 64 pixels.
+    fn render([x, y]: [u32; 2], [width, height]: [u32; 2], spp: u32) -> Self {
+        let core = Rect::new(x, y, width, height);
         let Some(scene) = Scene::by_name("all") else { unreachable!("the scene of the tests") };
         let Ok(geometry) = TileGeometry::new([64, 64], core, Halo::default()) else { unreachable!("it lies inside") };
         let Ok(tile) = scene.tile(geometry, spp, &Execution::default()) else { unreachable!("it is small") };
