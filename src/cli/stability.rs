@@ -171,10 +171,11 @@ fn to_json(case: &Case, preset: &str, outcome: &Outcome) -> Value {
         "clean": outcome.clean.map(deviation),
         "oracle_clean": outcome.oracle_clean.map(deviation),
         "energy": outcome.energy,
+        "oracle_energy": outcome.oracle_energy,
         "bounds": {
             "step": bounds.step, "step_rms": bounds.step_rms, "differently": bounds.differently, "whole": bounds.whole,
             "clean": outcome.clean_bound.map(|(field, bound)| json!({ "field": field, "bound": bound })),
-            "energy": bounds.energy,
+            "energy": bounds.energy.map(|e| e.is_finite().then_some(e)),
             "reason": bounds.reason,
         },
     })

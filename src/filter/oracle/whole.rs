@@ -77,9 +77,16 @@ impl<'a> Whole<'a> {
     pub fn image(&self) -> Vec<Color> {
         let mut colors = self.colors();
         for t in 0..self.params.boxes.len() {
-            colors = self.step(t, &colors).colors;
+            colors = Self::stored(self.step(t, &colors).colors);
         }
         self.pixels(&colors)
+    }
+
+    /// As colours are kept between iterations: in f32. Without, what f32 cannot tell from a constant would be normalised
+    /// to unit deviation.
+    pub fn stored(mut colors: Vec<Color>) -> Vec<Color> {
+        colors.iter_mut().flatten().for_each(|v| *v = f64::from(*v as f32));
+        colors
     }
 
     fn plane(&self, plane: usize, rows: &[usize]) -> Vec<f64> {
@@ -217,7 +224,9 @@ impl<'a> Whole<'a> {
                     for k in 0..3 {
                         let channel: Vec<f64> = out.iter().map(|c| c[k]).collect();
                         let (tamed, margin) = tame_spikes(&channel);
-                        let near = margin * deviation(&channel) < NEAR_SPIKE * step.size[at][k];
+                        // Filtered samples are rounded to f32 before.
+                        let error = (NEAR_SPIKE * step.size[at][k]).max(f64::from(f32::from_bits(2)));
+                        let near = margin * deviation(&channel) < error;
                         step.near[at] += u32::from(near && tamed != channel);
                         out.iter_mut().zip(tamed).for_each(|(c, tamed)| c[k] = tamed);
                     }

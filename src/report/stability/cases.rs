@@ -19,8 +19,8 @@ fn some(planes: Vec<&mut Vec<f32>>, first: usize, every: usize, values: &[f32]) 
     }
 }
 
-const COLLAPSE: &str = "one value far from all others takes the deviation for itself: the colours of every neighbourhood that \
-     draws it fall into one histogram bin, and their weights change";
+const FIREFLY: &str = "one value far from all others takes the deviation for itself: colours fall into one histogram bin, their \
+     weights vanish, and the value is averaged in its own pixel for good, in others as often as chance draws it";
 
 fn fireflies() -> Vec<Case> {
     let mut cases = Vec::new();
@@ -37,7 +37,7 @@ fn fireflies() -> Vec<Case> {
             Case::new(format!("firefly-{name}"), Base::Image, bounds, move |s| {
                 some(s.channel("color"), 545, 9999, &[value])
             })
-            .known(COLLAPSE),
+            .known(FIREFLY),
         );
         let bounds = Bounds {
             energy: [0.3, 3.0],
@@ -208,15 +208,16 @@ const UNITS: &str = "a difference of 0.1 is never too far, in the scene's own un
 
 fn scales() -> Vec<Case> {
     let mut cases = Vec::new();
-    for (name, scale) in [("1e-6", 1e-6), ("1e-3", 1e-3), ("1e3", 1e3), ("1e6", 1e6)] {
-        let reason = "the unit is nothing that the image shows";
-        let bounds = Bounds::usual(Against::Rms(0.02), reason);
-        cases.push(
-            Case::new(format!("units-{name}"), Base::Image, bounds, move |s| {
-                Samples::map(s.channel("P"), |v| v * scale)
-            })
-            .known(UNITS),
-        );
+    let reason = "the unit is nothing that the image shows";
+    // Beside normals and albedo positions reject little; alone they must do it all.
+    for (group, base) in [("units", Base::Image), ("units-alone", Base::Positions)] {
+        for (name, scale) in [("1e-6", 1e-6), ("1e-3", 1e-3), ("1e3", 1e3), ("1e6", 1e6)] {
+            let bounds = Bounds::usual(Against::Rms(0.02), reason);
+            let case = Case::new(format!("{group}-{name}"), base, bounds, move |s| {
+                Samples::map(s.channel("P"), |v| v * scale);
+            });
+            cases.push(case.known(UNITS));
+        }
     }
     for (name, scale) in [("1e-6", 1e-6_f32), ("1e-3", 1e-3), ("1e3", 1e3), ("1e6", 1e6)] {
         let reason =

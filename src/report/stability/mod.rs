@@ -5,16 +5,16 @@
 //! - **Finite**: always.
 //! - **Steps**: each iteration against the oracle's, from the same rounded colours and the same draws. The deviation of a
 //!   sample is relative to the mean absolute colour that is filtered into its pixel; differences of f32's least step,
-//!   1.4e-45, are none. The steps are discontinuous (a
+//!   1.4e-45, twice over are none. The steps are discontinuous (a
 //!   value falls into one bin or the next, a candidate is in or out, a sample is a spike or not); where the oracle saw such
 //!   a decision within f32's error of its threshold *and* the deviation is beyond the bound, the pixel is counted as
 //!   decided differently, with its own greatest deviation, and the count has a bound.
-//! - **Whole**: the filtered image against an oracle that runs by itself through all iterations, where decisions and what
-//!   follows from them have had their way. See [`Deviation`] for what it is relative to.
+//! - **Whole**: the filtered image against an oracle that runs by itself through all iterations (its colours are rounded
+//!   to f32 between them), where decisions and what follows from them have had their way. See [`Deviation`] for what it is relative to.
 //! - **Clean**: the image against that of the case without what is wrong with it ([`Against`]). Where the oracle's image
 //!   is as far from its own clean image, the algorithm does that, not the implementation: a *known failure*, if the case
 //!   says why.
-//! - **Energy**: sum of the filtered image over that of the input.
+//! - **Energy**: sum of the filtered image over that of the input; likewise.
 
 mod cases;
 mod invariances;
@@ -107,7 +107,7 @@ pub struct Case {
     pub back: Back,
     /// What is asked of it.
     pub bounds: Bounds,
-    /// Why the published algorithm is known to miss the bound of the clean case, if it is.
+    /// Why the published algorithm is known to miss the bounds of the clean case and of energy, if it is.
     pub known: Option<&'static str>,
     /// Parameters set in every preset.
     settings: Vec<(&'static str, &'static str)>,

@@ -12,6 +12,8 @@ pub enum Base {
     Image,
     /// The same without features.
     NoFeatures,
+    /// The same with the first hit's position as the only feature.
+    Positions,
     /// 16 x 16 pixels, 1 sample each.
     OneSample,
     /// 2 x 2 pixels, 1024 samples each.
@@ -39,7 +41,7 @@ impl Base {
         // Sky, a ball in motion and the edge of another before it, and the floor.
         let corner = [16, 14];
         let (corner, size, spp) = match self {
-            Self::Image | Self::NoFeatures => (corner, [16, 16], 4),
+            Self::Image | Self::NoFeatures | Self::Positions => (corner, [16, 16], 4),
             Self::OneSample => (corner, [16, 16], 1),
             Self::ManySamples => ([20, 26], [2, 2], 1024),
             Self::Small => ([20, 18], [6, 6], 4),
@@ -50,6 +52,9 @@ impl Base {
         samples.keep(|channel| !matches!(channel.name.as_str(), "P2" | "N2"));
         if self == Self::NoFeatures {
             samples.keep(|channel| !matches!(channel.role, Role::Feature { .. }));
+        }
+        if self == Self::Positions {
+            samples.keep(|channel| !matches!(channel.role, Role::Feature { .. }) || channel.name == "P");
         }
         samples
     }
