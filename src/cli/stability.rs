@@ -173,7 +173,8 @@ fn to_json(case: &Case, preset: &str, outcome: &Outcome) -> Value {
         "energy": outcome.energy,
         "oracle_energy": outcome.oracle_energy,
         "bounds": {
-            "step": bounds.step, "step_rms": bounds.step_rms, "differently": bounds.differently, "whole": bounds.whole,
+            "step": bounds.step, "step_rms": bounds.step_rms, "differently": bounds.differently, "whole": bounds.whole.is_finite().then_some(bounds.whole),
+            "whole_median": bounds.whole_median,
             "clean": outcome.clean_bound.map(|(field, bound)| json!({ "field": field, "bound": bound })),
             "energy": bounds.energy.map(|e| e.is_finite().then_some(e)),
             "reason": bounds.reason,

@@ -41,6 +41,9 @@ const DIFFERENTLY: f64 = 0.05;
 /// RMS deviation of the whole: a few pixels decided differently, a few per cent off each.
 const WHOLE: f64 = 0.02;
 
+/// Median deviation of the whole: some iterations of f32 sums, each of about 10 roundings.
+const WHOLE_MEDIAN: f64 = 1e-5;
+
 /// What is compared with the clean case, and how far it may be from it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Against {
@@ -80,6 +83,8 @@ pub struct Bounds {
     pub differently: f64,
     /// RMS deviation of the whole.
     pub whole: f64,
+    /// Median deviation of the whole: most pixels are decided alike, whatever happens to a few.
+    pub whole_median: f64,
     /// Deviation from the clean case.
     pub clean: Against,
     /// Least and greatest energy ratio.
@@ -93,7 +98,16 @@ impl Bounds {
     fn usual(clean: Against, reason: &'static str) -> Self {
         // A weighted mean over a neighbourhood moves light, on a crop of 16 pixels not by half of it.
         let energy = [0.5, 2.0];
-        Self { step: STEP, step_rms: STEP_RMS, differently: DIFFERENTLY, whole: WHOLE, clean, energy, reason }
+        Self {
+            step: STEP,
+            step_rms: STEP_RMS,
+            differently: DIFFERENTLY,
+            whole: WHOLE,
+            whole_median: WHOLE_MEDIAN,
+            clean,
+            energy,
+            reason,
+        }
     }
 }
 

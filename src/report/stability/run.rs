@@ -262,12 +262,16 @@ impl Deviation {
     }
 }
 
+/// NaN is beyond every bound.
+fn beyond_bound(value: f64, bound: f64) -> bool {
+    value > bound || value.is_nan()
+}
+
 impl Outcome {
     fn judge(&mut self, bounds: &Bounds, may_be_known: bool) {
         let mut beyond = Vec::new();
         let mut at_most = |what: &str, value: f64, bound: f64| {
-            // NaN is beyond everything.
-            if !(value <= bound) {
+            if beyond_bound(value, bound) {
                 beyond.push(format!("{what} {value:.2e} is more than {bound:.2e}"));
             }
         };
@@ -277,6 +281,7 @@ impl Outcome {
         let share = self.steps.differently as f64 / self.steps.pixels.max(1) as f64;
         at_most("share of pixels decided differently", share, bounds.differently);
         at_most("RMS deviation of the whole", self.whole.rms, bounds.whole);
+        at_most("median deviation of the whole", self.whole.median, bounds.whole_median);
         let (mut failed, mut known) = (!beyond.is_empty(), false);
         // What the oracle does as well is the algorithm's, if the case says why.
         let mut algorithm = |what: String, by_oracle: bool| {
@@ -291,7 +296,7 @@ impl Outcome {
         }
         if let (Some((which, bound)), Some(fast), Some(oracle)) = (self.clean_bound, self.clean, self.oracle_clean) {
             let value = fast.field(which);
-            if !(value <= bound) {
+            if beyond_bound(value, bound) {
                 let what = format!("{which} deviation from the clean case {value:.2e} is more than {bound:.2e}");
                 algorithm(what, oracle.field(which) > bound);
             }
@@ -302,5 +307,52 @@ impl Outcome {
             (false, false) => Verdict::Ok,
         };
         self.beyond = beyond;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::cases;
+    use super::*;
+
+    /// What CI can afford of the table; `rpfd stability` runs it for every preset.
+    #[test]
+    fn every_case_is_within_its_bounds_for_lean() {
+        let (mut lab, mut failed) = (Lab::default(), Vec::new());
+        for case in cases() {
+            let outcome = lab.run(&case, "lean").unwrap();
+            if outcome.verdict == Verdict::Failed {
+                failed.push(format!("{}: {}", case.name, outcome.beyond.join("; ")));
+            }
+        }
+        assert!(failed.is_empty(), "{failed:#?}");
+    }
+
+    #[test]
+    fn names_are_unique_and_bounds_have_reasons() {
+        let mut names = std::collections::HashSet::new();
+        for case in cases() {
+            assert!(!case.bounds.reason.is_empty());
+            assert!(names.insert(case.name.clone()), "{} is there twice", case.name);
+        }
+    }
+
+    /// A bound that is missed is known only where the case says why and the oracle misses it as well.
+    #[test]
+    fn known_is_what_the_oracle_does_too() {
+        let case = cases().into_iter().find(|case| case.name == "exposure-1e3").unwrap();
+        let good = Lab::default().run(&case, "lean").unwrap();
+        let far = Some(Deviation { rms: 9.0, ..Deviation::default() });
+        let verdict = |clean, oracle_clean, steps: Steps, may_be_known| {
+            let mut outcome = Outcome { clean, oracle_clean, steps, ..good.clone() };
+            outcome.judge(&case.bounds, may_be_known);
+            (outcome.verdict, outcome.beyond.len())
+        };
+        assert_eq!(verdict(good.clean, good.oracle_clean, good.steps, true), (Verdict::Ok, 0));
+        assert_eq!(verdict(far, far, good.steps, true), (Verdict::Known, 1));
+        assert_eq!(verdict(far, far, good.steps, false), (Verdict::Failed, 1));
+        assert_eq!(verdict(far, good.oracle_clean, good.steps, true), (Verdict::Failed, 1));
+        let unstable = Steps { greatest: f64::NAN, ..good.steps };
+        assert_eq!(verdict(far, far, unstable, true), (Verdict::Failed, 2));
     }
 }
