@@ -21,6 +21,7 @@ mod post;
 mod progress;
 mod schedule;
 mod serve;
+mod stability;
 mod synth;
 
 use clap::Parser;
@@ -53,6 +54,7 @@ enum Command {
     Inspect(inspect::Args),
     Post(Box<post::Args>),
     Serve(serve::Args),
+    Stability(stability::Args),
     Synth(synth::Args),
 }
 
@@ -64,6 +66,7 @@ pub fn main() -> ExitCode {
         Command::Inspect(args) => (args.json, inspect::run(&args)),
         Command::Post(args) => (args.json, post::run(&args)),
         Command::Serve(args) => (false, serve::run(args)),
+        Command::Stability(args) => (args.json, stability::run(&args)),
         Command::Synth(args) => (args.json, synth::run(&args)),
     };
     match result {

@@ -5,6 +5,7 @@ mod failures;
 mod filter;
 mod inspect;
 mod post;
+mod stability;
 mod synth;
 
 use rpfd::{

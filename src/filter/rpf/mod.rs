@@ -40,7 +40,7 @@ use relevance::Relevant;
 const BAND: u32 = 8;
 
 /// What iteration `t` has to compute: what later ones read, inside the data window.
-fn region(geometry: &TileGeometry, params: &Params, varying: bool, t: usize) -> Rect {
+pub(super) fn region(geometry: &TileGeometry, params: &Params, varying: bool, t: usize) -> Rect {
     let later: u32 = (t + 1..params.boxes.len()).map(|t| params.reach_of(t)).sum();
     geometry.core().grown(later + if varying { params.fill_reach() } else { 0 }, &geometry.window())
 }
@@ -68,8 +68,47 @@ fn most_rows(params: &Params, max_per_pixel: usize) -> usize {
     (0..params.boxes.len()).map(|t| params.neighbors(t, max_per_pixel)).max().unwrap_or(0)
 }
 
+/// The samples, and their pixels in the data window, that the draws around a pixel end at, before any is rejected.
+pub(super) fn draws(
+    tile: &SampleTile,
+    params: &Params,
+    seed: u64,
+    t: usize,
+    x: u32,
+    y: u32,
+) -> impl Iterator<Item = (usize, usize)> {
+    let (image, window) = (tile.geometry().image(), tile.geometry().window());
+    let own = tile.samples_of(window.index(x, y)).len();
+    let offsets = neighborhood::Offsets::new(params.boxes[t]);
+    let center = neighborhood::Center { x, y, key: random::pixel_key(seed, x, y, t), wanted: params.neighbors(t, own) };
+    (0..(center.wanted - own) as u64).filter_map(move |draw| {
+        let (pixel, bits) = neighborhood::candidate(&image, &window, &offsets, &center, draw)?;
+        let samples = tile.samples_of(pixel);
+        (!samples.is_empty()).then(|| (pixel, neighborhood::pick_sample(bits, &samples) as usize))
+    })
+}
+
 /// Filters a tile.
 pub(super) fn filter(tile: &SampleTile, params: &Params, execution: &Execution) -> Result<Filtered, Stopped> {
+    let (colors, report) = iterate(tile, params, execution, |_| {})?;
+    finish(tile, |x, y| pixel_mean(tile, &colors, x, y), params.fill_reach(), report, execution)
+}
+
+/// Filters a tile, and keeps the colours of all samples (R, G, B next to each other) after each iteration; outside what
+/// an iteration has to compute they mean nothing. For comparison with the [oracle](super::oracle).
+pub fn trace(tile: &SampleTile, params: &Params, execution: &Execution) -> Result<Vec<Vec<f32>>, Stopped> {
+    let mut trace = Vec::with_capacity(params.boxes.len());
+    iterate(tile, params, execution, |colors| trace.push(colors.to_vec()))?;
+    Ok(trace)
+}
+
+/// All iterations; `after` sees the colours after each.
+fn iterate(
+    tile: &SampleTile,
+    params: &Params,
+    execution: &Execution,
+    mut after: impl FnMut(&[f32]),
+) -> Result<(Vec<f32>, Report), Stopped> {
     let relevant = Relevant::of(tile, execution.leave_out);
     let rows = most_rows(params, tile.max_per_pixel() as usize);
     let terms = information::entropy_terms(rows);
@@ -88,6 +127,7 @@ pub(super) fn filter(tile: &SampleTile, params: &Params, execution: &Execution) 
             return Err(Stopped);
         }
         std::mem::swap(&mut colors, &mut next);
+        after(&colors);
         if let Some(progress) = execution.progress {
             progress((t + 1) as f32 / iterations as f32);
         }
@@ -102,7 +142,7 @@ pub(super) fn filter(tile: &SampleTile, params: &Params, execution: &Execution) 
         left_out: relevant.left_out,
         ..Report::default()
     };
-    finish(tile, |x, y| pixel_mean(tile, &colors, x, y), params.fill_reach(), report, execution)
+    Ok((colors, report))
 }
 
 /// The colours of all samples, R, G, B next to each other.

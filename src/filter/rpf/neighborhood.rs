@@ -92,11 +92,12 @@ impl Rows {
     }
 }
 
-/// What a candidate is tested against, for one feature: the pixel's own samples.
+/// What a candidate is tested against, for one feature: the pixel's own samples. In f64: far from the origin the mean
+/// of f32 values lies between two of them, and rounding it would move the cluster by half a step.
 #[derive(Clone, Copy, Debug)]
 struct Cluster {
-    mean: f32,
-    threshold: f32,
+    mean: f64,
+    threshold: f64,
     /// Whether any own sample lacks the feature: then candidates may lack it too.
     missing: bool,
 }
@@ -206,7 +207,7 @@ fn cluster(own: &[f32], deviations: f64, floor: f64) -> Cluster {
     let variance = present.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count;
     let threshold = (deviations * variance.sqrt()).max(floor);
     // Without any, the mean is NaN, and no candidate that has the feature passes.
-    Cluster { mean: mean as f32, threshold: threshold as f32, missing: own.iter().any(|v| v.is_nan()) }
+    Cluster { mean, threshold, missing: own.iter().any(|v| v.is_nan()) }
 }
 
 /// Keeps the own rows, and of the others those inside the cluster.
@@ -215,11 +216,29 @@ fn keep_cluster(rows: &mut Rows, own: usize, value: impl Fn(u32) -> f32, cluster
     let mut kept = own;
     for row in own..samples.len() {
         let value = value(samples[row]);
-        let inside = (value - cluster.mean).abs() <= cluster.threshold || (cluster.missing && value.is_nan());
+        let inside =
+            (f64::from(value) - cluster.mean).abs() <= cluster.threshold || (cluster.missing && value.is_nan());
         samples[kept] = samples[row];
         pixels[kept] = pixels[row];
         kept += usize::from(inside);
     }
     samples.truncate(kept);
     pixels.truncate(kept);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Far from the origin the mean of a pixel's own values lies between two f32: candidates are compared with the mean
+    /// itself, not with the f32 next to it.
+    #[test]
+    fn clusters_far_from_the_origin_are_not_shifted() {
+        let step = 0.007_812_5;
+        let values: Vec<f32> = [0.0, 1.0, 1.0, 1.0, 14.0, -13.0, -12.0, 13.0].map(|i| 1e5 + i * step).to_vec();
+        let mut rows = Rows { samples: (0..8).collect(), pixels: vec![0; 8] };
+        // The mean is 0.75 steps above 1e5, and 0.1 is 12.8 steps.
+        keep_cluster(&mut rows, 4, |sample| values[sample as usize], &cluster(&values[..4], 3.0, 0.1));
+        assert_eq!(rows.samples, [0, 1, 2, 3, 6, 7]);
+    }
 }

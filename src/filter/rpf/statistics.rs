@@ -27,14 +27,26 @@ impl Span {
 }
 
 /// Replaces missing values (NaN) by the mean of the others, so that they stand in the middle: z = 0. If all are missing
-/// they become 0.
+/// they become 0. A column with missing values is shifted to its first value and scaled by a power of two, which
+/// normalising does not see: far from the origin the mean itself would be rounded away from the middle.
 pub(crate) fn impute(column: &mut [f32]) {
     let present = column.iter().filter(|v| !v.is_nan());
     let count = present.clone().count();
-    if count < column.len() {
-        let mean = if count == 0 { 0.0 } else { present.map(|&v| f64::from(v)).sum::<f64>() / count as f64 };
-        column.iter_mut().filter(|v| v.is_nan()).for_each(|v| *v = mean as f32);
+    if count == column.len() {
+        return;
     }
+    let Some(&first) = present.clone().next() else {
+        column.fill(0.0);
+        return;
+    };
+    let scale = safe_scale(present.fold(0.0, |size: f32, v| size.max(v.abs())));
+    let mut sum = 0.0;
+    for value in column.iter_mut().filter(|v| !v.is_nan()) {
+        *value = *value * scale - first * scale;
+        sum += f64::from(*value);
+    }
+    let mean = (sum / count as f64) as f32;
+    column.iter_mut().filter(|v| v.is_nan()).for_each(|v| *v = mean);
 }
 
 /// Fills the column up from its n-th value to whole lanes.
@@ -67,9 +79,11 @@ fn safe_scale(size: f32) -> f32 {
     if (LEAST..=GREATEST).contains(&size) || size == 0.0 {
         return 1.0;
     }
-    // The power of two that brings the size to between 1 and 2; a denormal is brought as near as f32 can.
-    let exponent = (size.to_bits() >> 23).clamp(1, 2 * EXPONENT_BIAS - 1);
-    f32::from_bits((2 * EXPONENT_BIAS - exponent) << 23)
+    // A small size is brought to between 1 and 2, a denormal as near as f32 can; a great one only as far down as it must,
+    // since what is small beside it would lose bits below 2^-126.
+    let target = if size > GREATEST { EXPONENT_BIAS + 39 } else { EXPONENT_BIAS };
+    let exponent = (size.to_bits() >> 23).max(1);
+    f32::from_bits((EXPONENT_BIAS + target - exponent) << 23)
 }
 
 /// Brings the first `n` values of a padded column to zero mean and unit deviation (with n, not n - 1), in place; what a
@@ -98,5 +112,43 @@ pub(crate) fn normalise<S: Simd>(simd: S, column: &mut [f32], n: usize, span: &S
     let inverse = Lanes::splat(simd, 1.0 / (sum(squares) / n as f32).sqrt());
     for chunk in column.chunks_exact_mut(LANES) {
         ((Lanes::from_slice(simd, chunk) - mean) * inverse).store_slice(chunk);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::filter::lanes::{SimdLevel, dispatch};
+
+    /// The missing stand at z = 0, also where the mean of the others is far from the origin and between two f32.
+    #[test]
+    fn missing_values_stand_in_the_middle_far_from_the_origin() {
+        let mut column = vec![0.0; LANES];
+        column[..4].copy_from_slice(&[16_777_216.0, 16_777_218.0, 16_777_218.0, f32::NAN]);
+        impute(&mut column[..4]);
+        pad(&mut column, 4);
+        dispatch!(SimdLevel::default().level(), simd => {
+            let span = span(simd, &column);
+            normalise(simd, &mut column, 4, &span);
+        });
+        assert!(column[3].abs() < 1e-6, "{:?}", &column[..4]);
+    }
+
+    #[test]
+    fn missing_values_among_the_greatest_stay_finite() {
+        let mut column = [f32::MAX, f32::NAN, -f32::MAX, -f32::MAX, f32::NAN];
+        impute(&mut column);
+        assert!(column.iter().all(|v| v.is_finite()), "{column:?}");
+    }
+
+    /// Colours are scaled as a whole: beside f32::MAX, one of 1e-3 keeps all its bits.
+    #[test]
+    fn small_values_keep_their_bits_beside_the_greatest() {
+        for size in [f32::MAX, 1e30, 1e-3, 1e-44] {
+            let scale = safe_scale(size);
+            assert!((1e-3 * scale).is_normal() && (1e-3 * scale) / scale == 1e-3, "{size:e}: {scale:e}");
+            let square = (2.0 * (size * scale)).powi(2) * 65536.0;
+            assert!(square.is_normal(), "{size:e}: {square:e}");
+        }
     }
 }

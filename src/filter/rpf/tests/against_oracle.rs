@@ -4,12 +4,13 @@
 use super::{is_feature, method, scene};
 use crate::filter::lanes::{SimdLevel, dispatch};
 use crate::filter::method::Algorithm;
-use crate::filter::oracle::{self, Columns};
+use crate::filter::oracle::{self, Columns, Whole};
 use crate::filter::rpf::iteration::{ColumnOrder, Pass, Scratch};
-use crate::filter::rpf::neighborhood::{Center, Offsets, candidate, pick_sample};
+use crate::filter::rpf::neighborhood::Offsets;
 use crate::filter::rpf::relevance::{Relevant, Source};
-use crate::filter::rpf::{Params, information, interleaved_colors, most_rows, random, spikes};
-use crate::filter::{Execution, Role, SampleTile};
+use crate::filter::rpf::{Params, draws, information, interleaved_colors, most_rows, spikes};
+use crate::filter::{ChannelSet, Counts, Execution, Rect, Role, SampleTile, TileGeometry};
+use crate::synth::Scene;
 
 /// Within this of a threshold, a decision may fall either way.
 const NEAR: f64 = 1e-5;
@@ -138,18 +139,15 @@ fn neighbourhoods_accept_the_same_candidates() {
             let window = tile.geometry().window();
             let own = tile.samples_of(window.index(x, y));
             let mut fast = scratch.rows.samples[own.len()..].iter().copied().peekable();
-            let key = random::pixel_key(pass.execution.seed, x, y, pass.t);
-            let center = Center { x, y, key, wanted: params.neighbors(pass.t, own.len()) };
-            for draw in 0..(center.wanted - own.len()) as u64 {
-                let Some((pixel, bits)) = candidate(&window, &window, &pass.offsets, &center, draw) else { continue };
-                let sample = pick_sample(bits, &tile.samples_of(pixel));
+            for (_, sample) in draws(&tile, &params, pass.execution.seed, pass.t, x, y) {
+                let sample = sample as u32;
                 let (mut accepted, mut margin) = (true, f64::INFINITY);
                 for &(plane, position) in &features {
                     let value = |s: usize| f64::from(tile.value(plane, s));
                     let own: Vec<f64> = own.clone().map(value).collect();
                     let deviations = if position { params.position_threshold } else { params.feature_threshold };
-                    let (inside, near) =
-                        oracle::accepts(&own, value(sample as usize), deviations, params.threshold_floor);
+                    let cluster = oracle::Cluster::of(&own, deviations, params.threshold_floor);
+                    let (inside, near) = cluster.accepts(value(sample as usize));
                     accepted &= inside;
                     margin = margin.min(near);
                 }
@@ -157,7 +155,7 @@ fn neighbourhoods_accept_the_same_candidates() {
                     tally.near += 1;
                     fast.next_if_eq(&sample);
                 } else if accepted {
-                    assert_eq!(fast.next(), Some(sample), "at ({x}, {y}), draw {draw}");
+                    assert_eq!(fast.next(), Some(sample), "at ({x}, {y})");
                     tally.add(0.0);
                 } else {
                     rejected += 1;
@@ -280,111 +278,45 @@ fn spikes_agree() {
     tally.check("spikes", 1e-6);
 }
 
-/// All of RPF by the oracle's steps: only the random draws are the fast path's.
-fn oracle_image(tile: &SampleTile, params: &Params, seed: u64) -> Vec<[f64; 3]> {
-    let window = tile.geometry().window();
-    let relevant = Relevant::of(tile, true);
-    let mut colors: Vec<[f64; 3]> =
-        interleaved_colors(tile).chunks_exact(3).map(|c| std::array::from_fn(|k| f64::from(c[k]))).collect();
-    let plane =
-        |plane: usize, rows: &[usize]| rows.iter().map(|&s| f64::from(tile.value(plane, s))).collect::<Vec<_>>();
-    for t in 0..params.boxes.len() {
-        let offsets = Offsets::new(params.boxes[t]);
-        let rows = |x: u32, y: u32| {
-            let own = tile.samples_of(window.index(x, y));
-            let mut rows: Vec<usize> = own.clone().collect();
-            let wanted = params.neighbors(t, own.len());
-            let center = Center { x, y, key: random::pixel_key(seed, x, y, t), wanted };
-            for draw in 0..(wanted - own.len()) as u64 {
-                let Some((pixel, bits)) = candidate(&window, &window, &offsets, &center, draw) else { continue };
-                let sample = pick_sample(bits, &tile.samples_of(pixel)) as usize;
-                let accepted = relevant.features().iter().all(|feature| {
-                    let deviations =
-                        if feature.position { params.position_threshold } else { params.feature_threshold };
-                    let own = plane(feature.plane, &rows[..own.len()]);
-                    oracle::accepts(
-                        &own,
-                        f64::from(tile.value(feature.plane, sample)),
-                        deviations,
-                        params.threshold_floor,
-                    )
-                    .0
-                });
-                if accepted {
-                    rows.push(sample);
-                }
-            }
-            rows
-        };
-        let columns = |rows: &[usize]| Columns {
-            positions: (0..2).map(|p| plane(p, rows)).collect(),
-            random: relevant.random().iter().map(|&p| plane(p, rows)).collect(),
-            features: relevant.features().iter().map(|f| plane(f.plane, rows)).collect(),
-            colors: (0..3).map(|k| rows.iter().map(|&s| colors[s][k]).collect()).collect(),
-        };
-        let weights_at = |x: u32, y: u32| oracle::weigh(&columns(&rows(x, y)).normalised(), params.bins, t);
-        let spacing = params.information_grid;
-        let weights = |x: u32, y: u32| {
-            if spacing == 1 {
-                return weights_at(x, y);
-            }
-            let axis = |pixel: u32, size: u32| {
-                let (low, high) = (pixel / spacing * spacing, (pixel / spacing * spacing + spacing).min(size - 1));
-                let share = if high > low { f64::from(pixel - low) / f64::from(high - low) } else { 0.0 };
-                [(low, 1.0 - share), (high, share)]
-            };
-            let (mut alpha, mut beta, mut confidence) = (vec![0.0; 3], vec![0.0; relevant.features().len()], 0.0);
-            for (node_y, share_y) in axis(y, window.height) {
-                for (node_x, share_x) in axis(x, window.width) {
-                    let share = share_x * share_y;
-                    if share > 0.0 {
-                        let node = weights_at(node_x, node_y);
-                        alpha.iter_mut().zip(node.alpha).for_each(|(a, node)| *a += share * node);
-                        beta.iter_mut().zip(node.beta).for_each(|(b, node)| *b += share * node);
-                        confidence += share * (1.0 - node.color_on_random).powi(2);
-                    }
-                }
-            }
-            oracle::Weights { alpha, beta, color_on_random: 1.0 - confidence.sqrt() }
-        };
-        let mut next = colors.clone();
-        for y in 0..window.height {
-            for x in 0..window.width {
-                let own = tile.samples_of(window.index(x, y));
-                let columns = columns(&rows(x, y));
-                let mut out = oracle::filter(&columns.normalised(), &columns.colors, &weights(x, y), own.len(), params);
-                if params.spikes {
-                    for k in 0..3 {
-                        let tamed = oracle::tame_spikes(&out.iter().map(|c| c[k]).collect::<Vec<_>>()).0;
-                        out.iter_mut().zip(tamed).for_each(|(c, tamed)| c[k] = tamed);
-                    }
-                }
-                next[own].copy_from_slice(&out);
-            }
-        }
-        colors = next;
-    }
-    (0..window.area() as usize).map(|pixel| oracle::pixel(&colors[tile.samples_of(pixel)])).collect()
-}
-
 /// The whole, through all iterations, with and without the grid. Where a decision fell the other way a pixel, and those
 /// that read it, differ a little more: few may.
 #[test]
 fn whole_images_agree() {
-    let tile = scene("all", [18, 14], 4);
-    for settings in [[("information_grid", "1"), ("spikes", "on")], [("information_grid", "4"), ("spikes", "off")]] {
-        let method = method("lean", &settings);
-        let Algorithm::Rpf(params) = method.algorithm() else { unreachable!("lean is RPF") };
-        let execution = Execution { seed: 9, ..Execution::default() };
-        let fast = crate::filter::filter(&tile, &method, &execution).unwrap().rgb;
-        let expected = oracle_image(&tile, params, 9);
-        let mut far = 0;
-        for (pixel, expected) in expected.iter().enumerate() {
-            let differs =
-                (0..3).any(|k| (f64::from(fast[k][pixel]) - expected[k]).abs() > 1e-4 * expected[k].max(0.01));
-            far += usize::from(differs);
+    let in_a_corner = |halo| TileGeometry::with_halo([40, 30], Rect::new(0, 4, 12, 10), halo).unwrap();
+    let scene = |name| Scene::by_name(name).unwrap();
+    for (what, tile) in [
+        ("image", super::scene("all", [18, 14], 4)),
+        ("tile with halo", super::part("motion", in_a_corner(20), 3)),
+        ("tile with too little halo", super::part("motion", in_a_corner(3), 3)),
+        ("holes", scene("all").tile_varying(in_a_corner(3), 2, &Execution::default()).unwrap()),
+        ("no film", without_film(&super::scene("glossy", [9, 30], 4))),
+    ] {
+        for settings in [[("information_grid", "1"), ("spikes", "on")], [("information_grid", "4"), ("spikes", "off")]]
+        {
+            let method = method("lean", &settings);
+            let Algorithm::Rpf(params) = method.algorithm() else { unreachable!("lean is RPF") };
+            let execution = Execution { seed: 9, ..Execution::default() };
+            let fast = crate::filter::filter(&tile, &method, &execution).unwrap().rgb;
+            let expected = Whole::new(&tile, params, 9).image();
+            let mut far = 0;
+            for (pixel, expected) in expected.iter().enumerate() {
+                let differs =
+                    (0..3).any(|k| (f64::from(fast[k][pixel]) - expected[k]).abs() > 1e-4 * expected[k].max(0.01));
+                far += usize::from(differs);
+            }
+            println!("{what}, {settings:?}: {far} of {} pixels differ by more than 1e-4", expected.len());
+            assert!(far * 10 < expected.len(), "{what}: {far} of {} pixels differ", expected.len());
         }
-        println!("{settings:?}: {far} of {} pixels differ by more than 1e-4", expected.len());
-        assert!(far * 10 < expected.len(), "{far} of {} pixels differ", expected.len());
     }
+}
+
+fn without_film(tile: &SampleTile) -> SampleTile {
+    let planes = 2..tile.channels().planes();
+    SampleTile::new(
+        *tile.geometry(),
+        ChannelSet::new(tile.channels().channels()[1..].to_vec()).unwrap(),
+        Counts::Uniform(tile.max_per_pixel()),
+        planes.map(|plane| tile.plane(plane).clone()).collect(),
+    )
+    .unwrap()
 }

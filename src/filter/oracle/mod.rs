@@ -3,28 +3,48 @@
 //! It shares no code with the fast path. Values are plain vectors, histograms are two-dimensional arrays, a distance is
 //! a loop over features. The steps are discontinuous (a candidate is in or out, a value falls into one bin or the next),
 //! so each is compared on the same inputs and decisions, and says how near its decisions were to falling the other way.
+//!
+//! [`Whole`] runs all of it over a tile; of the fast path it takes the random draws only.
+
+mod whole;
+
+pub use whole::{Step, Whole};
 
 use super::rpf::Params;
 
 /// How near a decision was to its threshold, relative to the threshold's size.
 pub type Margin = f64;
 
-/// Step 1: whether a candidate belongs to the cluster of a pixel's own samples in one feature, and how near that was.
-/// NaN is a missing feature: it belongs where own samples lack the feature too.
-pub fn accepts(own: &[f64], candidate: f64, deviations: f64, floor: f64) -> (bool, Margin) {
-    let present: Vec<f64> = own.iter().copied().filter(|v| !v.is_nan()).collect();
-    if candidate.is_nan() {
-        return (present.len() < own.len(), f64::INFINITY);
+/// Step 1: what a candidate is tested against in one feature.
+#[derive(Clone, Copy, Debug)]
+pub struct Cluster {
+    /// Mean of the pixel's own samples that have the feature; NaN if none has it.
+    mean: f64,
+    threshold: f64,
+    /// Whether any own sample lacks the feature.
+    lacks: bool,
+}
+
+impl Cluster {
+    /// Of a pixel's own samples; NaN is a missing feature.
+    pub fn of(own: &[f64], deviations: f64, floor: f64) -> Self {
+        let present: Vec<f64> = own.iter().copied().filter(|v| !v.is_nan()).collect();
+        let lacks = present.len() < own.len();
+        if present.is_empty() {
+            return Self { mean: f64::NAN, threshold: floor, lacks };
+        }
+        Self { mean: mean(&present), threshold: (deviations * deviation(&present)).max(floor), lacks }
     }
-    if present.is_empty() {
-        return (false, f64::INFINITY);
+
+    /// Whether a candidate belongs, and how near that was. NaN belongs where own samples lack the feature too.
+    pub fn accepts(&self, candidate: f64) -> (bool, Margin) {
+        let Self { mean, threshold, lacks } = *self;
+        if candidate.is_nan() || mean.is_nan() {
+            return (candidate.is_nan() && lacks, f64::INFINITY);
+        }
+        let distance = (candidate - mean).abs();
+        (distance <= threshold, (distance - threshold).abs() / threshold.max(f64::MIN_POSITIVE))
     }
-    let mean = mean(&present);
-    let threshold = (deviations * deviation(&present)).max(floor);
-    let distance = (candidate - mean).abs();
-    // Values far from 0 carry their own rounding, which is as good as a margin.
-    let size = threshold.max(mean.abs()).max(f64::MIN_POSITIVE);
-    (distance <= threshold, (distance - threshold).abs() / size)
 }
 
 /// Mean.
@@ -63,26 +83,43 @@ pub fn bin(value: f64, bins: u32) -> (usize, Margin) {
 
 /// Step 3: mutual information of two normalised columns in nats; 0 if either is constant.
 pub fn information(x: &[f64], y: &[f64], bins: u32) -> f64 {
-    let n = bins as usize;
-    let constant = |column: &[f64]| column.iter().all(|&v| v == column[0]);
-    if constant(x) || constant(y) {
-        return 0.0;
+    Histogram::of(x, bins).information(&Histogram::of(y, bins))
+}
+
+/// The bin of each of a column's values.
+struct Histogram {
+    bins: usize,
+    constant: bool,
+    of: Vec<usize>,
+}
+
+impl Histogram {
+    fn of(column: &[f64], bins: u32) -> Self {
+        let constant = column.iter().all(|&v| v == column[0]);
+        Self { bins: bins as usize, constant, of: column.iter().map(|&v| bin(v, bins).0).collect() }
     }
-    let mut joint = vec![vec![0.0; n]; n];
-    for (&a, &b) in x.iter().zip(y) {
-        joint[bin(a, bins).0][bin(b, bins).0] += 1.0 / x.len() as f64;
-    }
-    let of_x: Vec<f64> = joint.iter().map(|row| row.iter().sum()).collect();
-    let of_y: Vec<f64> = (0..n).map(|j| joint.iter().map(|row| row[j]).sum()).collect();
-    let mut information = 0.0;
-    for i in 0..n {
-        for j in 0..n {
-            if joint[i][j] > 0.0 {
-                information += joint[i][j] * (joint[i][j] / (of_x[i] * of_y[j])).ln();
+
+    fn information(&self, other: &Self) -> f64 {
+        if self.constant || other.constant {
+            return 0.0;
+        }
+        let n = self.bins;
+        let mut joint = vec![vec![0.0; n]; n];
+        for (&a, &b) in self.of.iter().zip(&other.of) {
+            joint[a][b] += 1.0 / self.of.len() as f64;
+        }
+        let of_x: Vec<f64> = joint.iter().map(|row| row.iter().sum()).collect();
+        let of_y: Vec<f64> = (0..n).map(|j| joint.iter().map(|row| row[j]).sum()).collect();
+        let mut information = 0.0;
+        for i in 0..n {
+            for j in 0..n {
+                if joint[i][j] > 0.0 {
+                    information += joint[i][j] * (joint[i][j] / (of_x[i] * of_y[j])).ln();
+                }
             }
         }
+        information.max(0.0)
     }
-    information.max(0.0)
 }
 
 /// A neighbourhood's columns by role, each with one value per row.
@@ -124,18 +161,19 @@ pub struct Weights {
 
 /// Steps 3 and 4 of normalised columns in iteration `t` (eq. 5).
 pub fn weigh(columns: &Columns, bins: u32, t: usize) -> Weights {
-    let sum = |column: &[f64], others: &[Vec<f64>]| -> f64 {
-        others.iter().map(|other| information(column, other, bins)).sum()
-    };
+    let histograms = |columns: &[Vec<f64>]| columns.iter().map(|c| Histogram::of(c, bins)).collect::<Vec<_>>();
+    let sum = |one: &Histogram, others: &[Histogram]| -> f64 { others.iter().map(|o| one.information(o)).sum() };
     let quotient = |a: f64, b: f64| if b == 0.0 { 0.0 } else { a / b };
     let growth = 1.0 + 0.1 * t as f64;
-    let d_c_r: Vec<f64> = columns.colors.iter().map(|c| sum(c, &columns.random)).collect();
-    let d_c_p: Vec<f64> = columns.colors.iter().map(|c| sum(c, &columns.positions)).collect();
-    let d_c_f: Vec<f64> = columns.features.iter().map(|f| sum(f, &columns.colors)).collect();
+    let (positions, random) = (histograms(&columns.positions), histograms(&columns.random));
+    let (features, colors) = (histograms(&columns.features), histograms(&columns.colors));
+    let d_c_r: Vec<f64> = colors.iter().map(|c| sum(c, &random)).collect();
+    let d_c_p: Vec<f64> = colors.iter().map(|c| sum(c, &positions)).collect();
+    let d_c_f: Vec<f64> = features.iter().map(|f| sum(f, &colors)).collect();
     let w_c_r: Vec<f64> = d_c_r.iter().zip(&d_c_p).map(|(&r, &p)| quotient(r, r + p)).collect();
     let whole = d_c_r.iter().sum::<f64>() + d_c_p.iter().sum::<f64>() + d_c_f.iter().sum::<f64>();
-    let beta = columns.features.iter().zip(&d_c_f).map(|(feature, &d)| {
-        let (r, p) = (sum(feature, &columns.random), sum(feature, &columns.positions));
+    let beta = features.iter().zip(&d_c_f).map(|(feature, &d)| {
+        let (r, p) = (sum(feature, &random), sum(feature, &positions));
         quotient(d, whole) * (1.0 - growth * quotient(r, r + p)).max(0.0)
     });
     Weights {
@@ -146,6 +184,7 @@ pub fn weigh(columns: &Columns, bins: u32, t: usize) -> Weights {
 }
 
 /// Step 5: the filtered colours of the first `own` rows (eq. 6, 7). `colors` are not normalised.
+/// Of absolute colours the result is the size that rounding errors are to be measured against.
 pub fn filter(
     normalised: &Columns,
     colors: &[Vec<f64>],

@@ -1,0 +1,162 @@
+//! Numerical stability on stiff and extreme cases: the production path against the f64 oracle and against the clean case.
+//!
+//! Each case changes a small render, and runs every preset on it. What is asked of it is written in its [`Bounds`]:
+//!
+//! - **Finite**: always.
+//! - **Steps**: each iteration against the oracle's, from the same rounded colours and the same draws. The deviation of a
+//!   sample is relative to the mean absolute colour that is filtered into its pixel; differences of f32's least step,
+//!   1.4e-45, twice over are none. The steps are discontinuous (a
+//!   value falls into one bin or the next, a candidate is in or out, a sample is a spike or not); where the oracle saw such
+//!   a decision within f32's error of its threshold *and* the deviation is beyond the bound, the pixel is counted as
+//!   decided differently, with its own greatest deviation, and the count has a bound.
+//! - **Whole**: the filtered image against an oracle that runs by itself through all iterations (its colours are rounded
+//!   to f32 between them), where decisions and what follows from them have had their way. See [`Deviation`] for what it is relative to.
+//! - **Clean**: the image against that of the case without what is wrong with it ([`Against`]). Where the oracle's image
+//!   is as far from its own clean image, the algorithm does that, not the implementation: a *known failure*, if the case
+//!   says why.
+//! - **Energy**: sum of the filtered image over that of the input; likewise.
+
+mod cases;
+mod invariances;
+mod measure;
+mod run;
+mod samples;
+
+pub use cases::cases;
+pub use measure::Deviation;
+pub use run::{Lab, Outcome, Steps, Verdict};
+pub use samples::Base;
+
+use crate::filter::{Method, ParameterError};
+use samples::Samples;
+
+/// Greatest deviation of a step: f32 columns are within 3e-5 deviations of the oracle's (a bound of its tests), and the
+/// steepest distance, g/2 = 25 at 8 samples, turns that into 2 sqrt(25 x 10 columns) x 3e-5 = 1e-3 of a weight.
+const STEP: f64 = 1e-3;
+/// RMS deviation of the steps: columns are typically 30 times nearer than at worst.
+const STEP_RMS: f64 = 3e-5;
+/// Share of pixels decided differently: a neighbourhood has some 10 000 values, one in 100 000 is as near a bin's edge
+/// as f32 errs, and about one pixel in ten has one; few of them change a weight by 1e-3.
+const DIFFERENTLY: f64 = 0.05;
+/// RMS deviation of the whole: a few pixels decided differently, a few per cent off each.
+const WHOLE: f64 = 0.02;
+
+/// Median deviation of the whole: some iterations of f32 sums, each of about 10 roundings.
+const WHOLE_MEDIAN: f64 = 1e-5;
+
+/// What is compared with the clean case, and how far it may be from it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Against {
+    /// Nothing: there is no clean case, or the input itself is another.
+    Nothing,
+    /// Not a bit may differ.
+    Exactly,
+    /// RMS deviation.
+    Rms(f64),
+    /// Median deviation: what is wrong is in a few places, most of the image must not care.
+    Median(f64),
+    /// RMS deviation, as a multiple of that between two seeds.
+    Seeds(f64),
+}
+
+/// How the filtered image is brought back to where the clean one can be compared with it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Back {
+    /// As it is.
+    Same,
+    /// Each value divided by this.
+    Divided(f64),
+    /// Left and right swapped.
+    Mirrored,
+    /// The image is filtered in square tiles of so many pixels, with the halo that they need.
+    Tiles(u32),
+}
+
+/// What is asked of a case, and why.
+#[derive(Clone, Debug)]
+pub struct Bounds {
+    /// Greatest deviation of any step, where no decision was near.
+    pub step: f64,
+    /// RMS deviation of the steps.
+    pub step_rms: f64,
+    /// Share of the steps' pixels that may be decided differently.
+    pub differently: f64,
+    /// RMS deviation of the whole.
+    pub whole: f64,
+    /// Median deviation of the whole: most pixels are decided alike, whatever happens to a few.
+    pub whole_median: f64,
+    /// Deviation from the clean case.
+    pub clean: Against,
+    /// Least and greatest energy ratio.
+    pub energy: [f64; 2],
+    /// Why these.
+    pub reason: &'static str,
+}
+
+impl Bounds {
+    /// What every case is asked unless it says otherwise.
+    fn usual(clean: Against, reason: &'static str) -> Self {
+        // A weighted mean over a neighbourhood moves light, on a crop of 16 pixels not by half of it.
+        let energy = [0.5, 2.0];
+        Self {
+            step: STEP,
+            step_rms: STEP_RMS,
+            differently: DIFFERENTLY,
+            whole: WHOLE,
+            whole_median: WHOLE_MEDIAN,
+            clean,
+            energy,
+            reason,
+        }
+    }
+}
+
+/// A stiff or extreme case.
+pub struct Case {
+    /// What it is called on the command line.
+    pub name: String,
+    /// What it starts from, which is also the clean case.
+    pub base: Base,
+    /// How the image is brought back.
+    pub back: Back,
+    /// What is asked of it.
+    pub bounds: Bounds,
+    /// Why the published algorithm is known to miss the bounds of the clean case and of energy, if it is.
+    pub known: Option<&'static str>,
+    /// Parameters set in every preset.
+    settings: Vec<(&'static str, &'static str)>,
+    change: Box<dyn Fn(&mut Samples) + Send + Sync>,
+}
+
+impl Case {
+    fn new(
+        name: impl Into<String>,
+        base: Base,
+        bounds: Bounds,
+        change: impl Fn(&mut Samples) + Send + Sync + 'static,
+    ) -> Self {
+        let change = Box::new(change);
+        Self { name: name.into(), base, back: Back::Same, bounds, known: None, settings: Vec::new(), change }
+    }
+
+    fn back(self, back: Back) -> Self {
+        Self { back, ..self }
+    }
+
+    fn known(self, known: &'static str) -> Self {
+        Self { known: Some(known), ..self }
+    }
+
+    fn samples(&self) -> Samples {
+        let mut samples = self.base.samples();
+        (self.change)(&mut samples);
+        samples
+    }
+
+    /// The method of a preset: `paper` with smaller boxes, so that the oracle is done with it.
+    fn method(&self, preset: &str) -> Result<Method, ParameterError> {
+        let smaller: &[_] = if preset == "paper" { &[("boxes", "15,9,5"), ("fractions", "0.5,0.5,0.5")] } else { &[] };
+        let settings: &[_] = if preset == "unfiltered" { &[] } else { &self.settings };
+        Method::with(preset, smaller.iter().chain(settings).copied())
+    }
+}
