@@ -12,6 +12,7 @@ mod input;
 mod inspect;
 mod post;
 mod progress;
+mod report;
 mod schedule;
 mod serve;
 mod synth;
@@ -35,6 +36,7 @@ Examples:
   rpfd demo                                       see it work, on a real render
   rpfd inspect render.tiles.zst                   what is in a file, and what is wrong with it
   rpfd filter render.tiles.zst -o render.exr      denoise a file
+  rpfd report --folder renders --html report.html error against run time, as a page
   rpfd serve --listen 0.0.0.0:8080                run the service
   rpfd post render.tiles.zst --to http://HOST:8080 -o render.exr
                                                   denoise a file by the service";
@@ -45,6 +47,7 @@ enum Command {
     Filter(Box<filter::Args>),
     Inspect(inspect::Args),
     Post(Box<post::Args>),
+    Report(Box<report::Args>),
     Serve(serve::Args),
     Synth(synth::Args),
 }
@@ -56,6 +59,7 @@ pub fn main() -> ExitCode {
         Command::Filter(args) => (args.json, filter::run(&args)),
         Command::Inspect(args) => (args.json, inspect::run(&args)),
         Command::Post(args) => (args.json, post::run(&args)),
+        Command::Report(args) => (args.json_errors(), report::run(&args)),
         Command::Serve(args) => (false, serve::run(args)),
         Command::Synth(args) => (args.json, synth::run(&args)),
     };
