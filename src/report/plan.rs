@@ -16,6 +16,8 @@ pub struct Key {
     pub content: String,
     /// Part of the image that is measured: x, y, width, height in pixels.
     pub crop: [u32; 4],
+    /// Whether that is a part only.
+    pub part: bool,
     /// Samples per pixel: the first so many of each.
     pub spp: u32,
     /// The preset.

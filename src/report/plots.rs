@@ -28,24 +28,31 @@ pub fn error_time(rows: &[Row]) -> Vec<Panel> {
     let fewest = rows.iter().map(|row| row.key.threads).min().unwrap_or(1);
     let rows: Vec<Row> = rows.iter().filter(|row| row.key.threads == fewest).cloned().collect();
     let methods = methods(&rows);
-    let sets = each(&rows, |row| (row.key.data.clone(), row.key.crop, row.key.spp));
-    let of = |set: &(String, [u32; 4], u32)| {
-        let set = set.clone();
-        rows.iter().filter(move |row| (&row.key.data, row.key.crop, row.key.spp) == (&set.0, set.1, set.2))
-    };
     let mut panels = Vec::new();
-    if sets.len() > 1 {
-        panels.extend(mean_panel(&rows, &methods, sets.len()));
-    }
-    for set in &sets {
-        let dots = of(set).map(|row| (row.label.clone(), (row.cpu.median, row.relmse())));
-        panels.push(time_panel(format!("{}, {} spp", set.0, set.2), ERROR, dots.collect(), &methods));
+    for part in [false, true] {
+        let rows: Vec<Row> = rows.iter().filter(|row| row.key.part == part).cloned().collect();
+        time_panels(&mut panels, &rows, &methods, if part { "crops" } else { "renders" });
     }
     panels
 }
 
+fn time_panels(panels: &mut Vec<Panel>, rows: &[Row], methods: &[String], what: &str) {
+    let sets = each(rows, |row| (row.key.data.clone(), row.key.crop, row.key.spp));
+    let of = |set: &(String, [u32; 4], u32)| {
+        let set = set.clone();
+        rows.iter().filter(move |row| (&row.key.data, row.key.crop, row.key.spp) == (&set.0, set.1, set.2))
+    };
+    if sets.len() > 1 {
+        panels.extend(mean_panel(rows, methods, sets.len(), what));
+    }
+    for set in &sets {
+        let dots = of(set).map(|row| (row.label.clone(), (row.cpu.median, row.relmse())));
+        panels.push(time_panel(format!("{}, {} spp", set.0, set.2), ERROR, dots.collect(), methods));
+    }
+}
+
 /// Geometric means of relMSE over that of the base, over all data sets: only methods that ran on each of them.
-fn mean_panel(rows: &[Row], methods: &[String], sets: usize) -> Option<Panel> {
+fn mean_panel(rows: &[Row], methods: &[String], sets: usize, what: &str) -> Option<Panel> {
     let ratio = |row: &Row| {
         let (a, base) = (&row.key, rows.iter().filter(|base| base.label == BASE));
         let base = base.map(|base| (&base.key, base.relmse()));
@@ -61,7 +68,7 @@ fn mean_panel(rows: &[Row], methods: &[String], sets: usize) -> Option<Panel> {
             dots.push((method.clone(), (mean(|p| p.0), mean(|p| p.1))));
         }
     }
-    let title = format!("geometric mean of {sets} renders");
+    let title = format!("geometric mean of {sets} {what}");
     (!dots.is_empty()).then(|| time_panel(title, "relMSE / unfiltered", dots, methods))
 }
 

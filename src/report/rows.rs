@@ -193,6 +193,7 @@ mod tests {
             data: "d".into(),
             content: "c".into(),
             crop: [0, 0, 1000, 500],
+            part: false,
             spp,
             preset: preset.into(),
             parameters: Vec::new(),

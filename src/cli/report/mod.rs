@@ -68,7 +68,8 @@ pub(crate) struct Args {
     /// Measure each so often; times are medians
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeats: u32,
-    /// Measure this part of each image as well, as an image of its own; then `paper` is measured on the part only
+    /// Measure this part of each image as well, as an image of its own, whose reference's own error is not
+    /// known; then `paper` is measured on the part only
     #[arg(long, value_name = "X,Y,W,H", value_parser = crop)]
     crop: Option<Rect>,
     /// CPU seconds that rendering one sample per pixel takes per megapixel: adds the cost of samples and filter together,
@@ -211,7 +212,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let measurement: &Measurement = state.get(&job.key)?;
         Some((job.key.clone(), methods[job.method].label.clone(), measurement.clone()))
     });
-    let own: BTreeMap<String, Own> = jobs.iter().map(|job| (job.key.data.clone(), sets[job.set].own)).collect();
+    // What is known of a whole image says little of a part of it.
+    let own = |job: &Job| if job.key.part { Own::default() } else { sets[job.set].own };
+    let own: BTreeMap<String, Own> = jobs.iter().map(|job| (job.key.data.clone(), own(job))).collect();
     let rows = rows(&measured.collect::<Vec<_>>(), &own);
     let mut references = BTreeMap::new();
     for job in &jobs {
@@ -258,6 +261,7 @@ fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Fa
                         data: data.clone(),
                         content: set.content(source),
                         crop: [part.x, part.y, part.width, part.height],
+                        part: part != image,
                         spp,
                         preset: named.method.preset_name().to_owned(),
                         parameters: Key::parameters_of(&named.method),
