@@ -6,8 +6,8 @@ pub fn srgb(image: &[[f32; 3]]) -> Vec<[f64; 3]> {
 }
 
 fn encode(linear: f32) -> f64 {
-    // NaN becomes 0: `max` returns the other one.
-    let linear = f64::from(linear.max(0.0).min(1.0));
+    // NaN is not above 0 either.
+    let linear = if linear > 0.0 { f64::from(linear.min(1.0)) } else { 0.0 };
     if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * libm::pow(linear, 1.0 / 2.4) - 0.055 }
 }
 

@@ -57,7 +57,7 @@ impl Seen {
         let plane = |c: usize| opponent.iter().map(|pixel| pixel[c]).collect::<Vec<f64>>();
         let [y, x, z] = [0, 1, 2].map(|c| filter(&plane(c), width, SENSITIVITY[c]));
         let seen =
-            y.iter().zip(&x).zip(&z).map(|((&y, &x), &z)| hunt_lab(linear([y, x, z]).map(|v| v.max(0.0).min(1.0))));
+            y.iter().zip(&x).zip(&z).map(|((&y, &x), &z)| hunt_lab(linear([y, x, z]).map(|v| v.clamp(0.0, 1.0))));
         // Achromatic, 0 to 1.
         let gray: Vec<f64> = opponent.iter().map(|pixel| (pixel[0] + 16.0) / 116.0).collect();
         let [smooth, first, second] = derivatives();

@@ -86,6 +86,12 @@ impl Row {
         f64::from(self.key.spp) * seconds_per_sample + self.cpu.median
     }
 
+    /// relMSE of as many plain samples as could be rendered in the time of [`Row::cost`].
+    pub fn plain_relmse(&self, seconds_per_sample: f64) -> Option<f64> {
+        let samples = self.cost(seconds_per_sample) / seconds_per_sample;
+        self.equal_spp.map(|equal| self.relmse() * libm::pow(samples / equal, self.slope.value()))
+    }
+
     fn peers(&self, other: &Self) -> bool {
         let of = |key: &Key| (key.data.clone(), key.crop, key.spp, key.threads);
         of(&self.key) == of(&other.key)
@@ -229,6 +235,8 @@ mod tests {
         assert!((good.slope.value() + 1.0).abs() < 1e-12);
         assert!((good.equal_spp.unwrap() - 32.0).abs() < 1e-9);
         assert!((good.cost(0.5) - 6.0).abs() < 1e-12);
+        // 12 samples take as long.
+        assert!((good.plain_relmse(0.5).unwrap() - 3.2 / 12.0).abs() < 1e-12);
         assert!(rows.iter().all(|row| row.repeatable));
     }
 

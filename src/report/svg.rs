@@ -58,7 +58,7 @@ pub fn draw(panels: &[Panel], across: usize) -> String {
     let (legend, legend_height) = legend(panels, width, height);
     let mut out = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {all}\" width=\"{width}\" height=\"{all}\" role=\"img\" \
-         font-family=\"sans-serif\" font-size=\"11\">\n<style>.t{{fill:#333}}.g{{stroke:#8884;stroke-width:1}}\
+         font-family=\"sans-serif\" font-size=\"11\">\n<style>.t{{fill:#333}}.g{{stroke:#888;stroke-opacity:.3}}\
          @media(prefers-color-scheme:dark){{.t{{fill:#ddd}}}}</style>\n",
         all = height + legend_height
     );
@@ -124,9 +124,13 @@ impl Axis {
         self.start + (self.end - self.start) * (value / self.low).ln() / (self.high / self.low).ln()
     }
 
-    /// Powers of ten, with 2 and 5 between them where there is room.
+    /// Powers of ten, with others between them where there is room.
     fn ticks(&self) -> Vec<f64> {
-        let steps: &[f64] = if self.high / self.low < 60.0 { &[1.0, 2.0, 5.0] } else { &[1.0] };
+        let steps: &[f64] = match self.high / self.low {
+            ..6.0 => &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0],
+            ..60.0 => &[1.0, 2.0, 5.0],
+            _ => &[1.0],
+        };
         let decades = self.low.log10().floor() as i32..=self.high.log10().ceil() as i32;
         let all = decades.flat_map(|decade| steps.iter().map(move |step| step * 10f64.powi(decade)));
         all.filter(|tick| (self.low..=self.high).contains(tick)).collect()
@@ -209,8 +213,8 @@ mod tests {
         let axis = Axis { low: 0.1, high: 100.0, start: 0.0, end: 300.0 };
         assert!((axis.at(1.0) - 100.0).abs() < 1e-9 && (axis.at(10.0) - 200.0).abs() < 1e-9);
         assert_eq!(axis.ticks().iter().map(|v| label(*v)).collect::<Vec<_>>(), ["0.1", "1", "10", "100"]);
-        let narrow = Axis::over([3.0, 3.0].into_iter(), 0.0, 1.0);
-        assert_eq!(narrow.ticks(), [2.0, 5.0]);
+        let narrow = Axis::over([3.1, 3.1].into_iter(), 0.0, 1.0);
+        assert_eq!(narrow.ticks(), [2.0, 3.0, 4.0, 5.0]);
         assert_eq!([0.001, 0.05, 2000.0, 1e5, 1e-5].map(label), ["0.001", "0.05", "2000", "1e5", "1e-5"]);
     }
 

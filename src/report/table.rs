@@ -60,7 +60,7 @@ pub fn cells(rows: &[Row], seconds_per_sample: Option<f64>) -> (Vec<&'static str
         "equal spp",
     ];
     if seconds_per_sample.is_some() {
-        headings.extend(["total s/Mpx", "plain s/Mpx"]);
+        headings.extend(["total s/Mpx", "plain s/Mpx", "plain relMSE"]);
     }
     let cells = rows.iter().map(|row| {
         let score = |name| short(row.scores.get(name));
@@ -88,6 +88,7 @@ pub fn cells(rows: &[Row], seconds_per_sample: Option<f64>) -> (Vec<&'static str
         if let Some(seconds) = seconds_per_sample {
             cells.push(short(row.cost(seconds)));
             cells.push(row.equal_spp.map_or_else(|| "-".to_owned(), |spp| short(spp * seconds)));
+            cells.push(row.plain_relmse(seconds).map_or_else(|| "-".to_owned(), short));
         }
         cells
     });
@@ -125,7 +126,8 @@ pub const NOTES: [&str; 6] = [
     "front: no other method on the same data set, samples and threads has both less relMSE and less CPU time.",
     "equal spp: plain samples per pixel whose mean would have the same relMSE, from the unfiltered error's slope: measured \
      where there are several sample counts, else -1.",
-    "total, plain: seconds per megapixel to render the samples and filter them, and to render the plain samples of equal error.",
+    "total, plain: CPU seconds per megapixel to render the samples and filter them, and to render the plain samples of equal \
+     error; plain relMSE: that of as many plain samples as could be rendered in the total time.",
 ];
 
 /// All numbers with all their digits, one row on a line (RFC 4180). Empty is unknown.
@@ -138,7 +140,7 @@ pub fn csv(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
         .join(",");
     out += ",relmse_less_own,mse_less_own,own_relmse,own_mse,repeats,cpu_s_per_mpx,cpu_s_per_mpx_min,cpu_s_per_mpx_max,\
             wall_s_per_mpx,wall_s_per_mpx_min,wall_s_per_mpx_max,planned_bytes,peak_resident_bytes,pareto,\
-            unfiltered_slope,slope_is,equal_spp,total_s_per_mpx,plain_s_per_mpx\n";
+            unfiltered_slope,slope_is,equal_spp,total_s_per_mpx,plain_s_per_mpx,plain_relmse_at_total\n";
     for row in rows {
         let known = |value: Option<f64>| value.map(|value| value.to_string()).unwrap_or_default();
         let mut cells = vec![
@@ -164,6 +166,7 @@ pub fn csv(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
         cells.push(known(row.equal_spp));
         cells.push(known(seconds_per_sample.map(|seconds| row.cost(seconds))));
         cells.push(known(seconds_per_sample.and_then(|seconds| Some(seconds * row.equal_spp?))));
+        cells.push(known(seconds_per_sample.and_then(|seconds| row.plain_relmse(seconds))));
         out += &cells.join(",");
         out += "\n";
     }
@@ -210,6 +213,7 @@ pub fn json(rows: &[Row], seconds_per_sample: Option<f64>, machine: &Machine) ->
             "equal_spp": row.equal_spp,
             "total_seconds_per_megapixel": seconds_per_sample.map(|seconds| row.cost(seconds)),
             "plain_seconds_per_megapixel": seconds_per_sample.and_then(|seconds| Some(seconds * row.equal_spp?)),
+            "plain_relmse_at_total": seconds_per_sample.and_then(|seconds| row.plain_relmse(seconds)),
         })
     };
     let formulas = COLUMNS.iter().map(|c| (c.name.to_owned(), c.formula.into())).collect::<serde_json::Map<_, _>>();
@@ -227,14 +231,8 @@ mod tests {
 
     #[test]
     fn numbers_are_short() {
-        let known = [
-            (0.0, "0"),
-            (0.012345, "0.0123"),
-            (0.5, "0.500"),
-            (3.14159, "3.14"),
-            (31.4159, "31.4"),
-            (31415.9, "31416"),
-        ];
+        let known =
+            [(0.0, "0"), (0.012345, "0.0123"), (0.5, "0.500"), (3.1234, "3.12"), (31.4159, "31.4"), (31415.9, "31416")];
         for (value, expected) in known.into_iter().chain([(1e-7, "1.00e-7"), (f64::NAN, "NaN"), (-0.0123, "-0.0123")]) {
             assert_eq!(short(value), expected);
         }

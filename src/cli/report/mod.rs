@@ -283,6 +283,41 @@ fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Fa
     Ok(jobs)
 }
 
+/// Samples that are in memory: an image's, and the part and number of them that is measured.
+#[derive(Default)]
+struct Loaded {
+    whole: Option<((usize, usize), SampleTile)>,
+    cut: Option<(CutOf, Cut)>,
+}
+
+/// Data set, source, part, and samples per pixel.
+type CutOf = (usize, usize, Rect, u32);
+
+/// Samples and their reference.
+type Cut = (SampleTile, Vec<[f32; 3]>);
+
+impl Loaded {
+    /// The samples of a job, and its reference.
+    fn of(&mut self, job: &Job, set: &DataSet, stop: &AtomicBool) -> Result<&Cut, Failure> {
+        let cut_of = (job.set, job.source, job.part, job.key.spp);
+        let cut = match self.cut.take().filter(|(of, _)| *of == cut_of) {
+            Some((_, cut)) => cut,
+            None => {
+                let from = (job.set, job.source);
+                // Another image's memory is free before.
+                let tile = match self.whole.take().filter(|(of, _)| *of == from) {
+                    Some((_, tile)) => tile,
+                    None => set.read(job.source, &Execution { stop: Some(stop), ..Execution::default() })?,
+                };
+                let few = subset(&tile, job.part, job.key.spp);
+                self.whole = Some((from, tile));
+                (few.map_err(|error| Failure::input("samples", error))?, set.reference_of(job.part))
+            }
+        };
+        Ok(&self.cut.insert((cut_of, cut)).1)
+    }
+}
+
 /// Makes the measurements that are not there yet.
 fn measure_all(
     args: &Args,
@@ -301,30 +336,14 @@ fn measure_all(
         pools.insert(threads as usize, pool);
     }
     let bar = progress::bar("measuring", jobs.len() as u64 * STEPS);
-    let mut whole: Option<((usize, usize), SampleTile)> = None;
-    let mut cut: Option<((usize, usize, Rect, u32), SampleTile, Vec<[f32; 3]>)> = None;
+    let mut loaded = Loaded::default();
     for (done, job) in jobs.iter().enumerate() {
         let position = done as u64 * STEPS;
         bar.set_position(position);
         if state.get(&job.key).is_some() {
             continue;
         }
-        let (set, from, part) = (&sets[job.set], (job.set, job.source), (job.set, job.source, job.part, job.key.spp));
-        if cut.as_ref().is_none_or(|(of, ..)| *of != part) {
-            // The other's memory is free before.
-            drop(cut.take());
-            if whole.as_ref().is_none_or(|(of, _)| *of != from) {
-                whole = None;
-            }
-            let tile = match whole.take() {
-                Some((_, tile)) => tile,
-                None => set.read(job.source, &Execution { stop: Some(stop), ..Execution::default() })?,
-            };
-            let few = subset(&tile, job.part, job.key.spp).map_err(|error| Failure::input("samples", error))?;
-            cut = Some((part, few, set.reference_of(job.part)));
-            whole = Some((from, tile));
-        }
-        let Some((_, tile, reference)) = &cut else { continue };
+        let (tile, reference) = loaded.of(job, &sets[job.set], stop)?;
         let measurement = one(job, methods, tile, reference, (&pools, stop), (&bar, position))?;
         let add = state.add(job.key.clone(), measurement);
         add.map_err(|error| Failure::failed("output_io", format!("the state file: {error}")))?;
@@ -365,7 +384,10 @@ fn write(
     let (machine, seconds_per_sample) = (Machine::here(), args.seconds_per_sample);
     let json = || format!("{:#}\n", table::json(rows, seconds_per_sample, &machine));
     let html = || page(&Page { rows, references, machine: &machine, seconds_per_sample });
-    let plots = || svg::draw(&plots::error_time(rows), 3);
+    // Whole images where there are such.
+    let plotted: Vec<Row> =
+        rows.iter().filter(|row| !row.key.part || rows.iter().all(|row| row.key.part)).cloned().collect();
+    let plots = || svg::draw(&plots::error_time(&plotted), 3);
     let contents: [&dyn Fn() -> String; 4] = [&json, &|| table::csv(rows, seconds_per_sample), &html, &plots];
     for (file, content) in outputs.into_iter().zip(contents) {
         let Some(mut file) = file else { continue };
