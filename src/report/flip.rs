@@ -1,9 +1,9 @@
-//! LDR-FLIP: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, *FLIP: A Difference Evaluator for Alternating
-//! Images*, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; section numbers below are the paper's. Constants are those
-//! of the authors' implementation 1.7, whose figures the test compares with.
+//! LDR-FLIP: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, *FLIP: A Difference Evaluator for
+//! Alternating Images*, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020; section numbers below are the paper's.
+//! Constants are those of the authors' implementation 1.7, whose figures the test compares with.
 //!
-//! The images are as on a display ([`srgb`](super::display::srgb)), seen at 67.02 pixels per degree: 0.7 m from a monitor of
-//! 3840 pixels on 0.7 m.
+//! The images are as on a display ([`srgb`](super::display::srgb)), seen at 67.02 pixels per degree: 0.7 m from a
+//! monitor of 3840 pixels on 0.7 m.
 
 use super::display::convolve;
 use std::f64::consts::PI;
@@ -94,8 +94,8 @@ fn filter(plane: &[f64], width: usize, gaussians: &[(f64, f64)]) -> Vec<f64> {
     out
 }
 
-/// A Gaussian and its first two derivatives (4.2), for features 0.082 degrees wide: the Gaussian sums to 1, the positive
-/// weights of the others to 1 and their negative ones to -1.
+/// A Gaussian and its first two derivatives (4.2), for features 0.082 degrees wide: the Gaussian sums to 1, the
+/// positive weights of the others to 1 and their negative ones to -1.
 fn derivatives() -> [Vec<f64>; 3] {
     let deviation = 0.5 * 0.082 * PIXELS_PER_DEGREE;
     let radius = (3.0 * deviation).ceil() as i32;
@@ -167,8 +167,8 @@ mod tests {
         (0..width * height).map(|i| [0, 1, 2].map(|c| value(i % width, i / width, c))).collect()
     }
 
-    /// The reference first, then the image; mean, and the errors of the first, middle and last pixel, by flip-evaluator 1.7
-    /// from PyPI (single precision) on the same values: `evaluate(reference, image, "LDR", True, False, True)`.
+    /// The reference first, then the image; mean, and the errors of the first, middle and last pixel, by flip-evaluator
+    /// 1.7 from PyPI (single precision) on the same values: `evaluate(reference, image, "LDR", True, False, True)`.
     type Golden = (usize, usize, [usize; 2], [usize; 2], f64, [f64; 3]);
 
     const GOLDEN: [Golden; 4] = [

@@ -13,8 +13,8 @@
 //! | `nonfinite` | values of x that are infinite or NaN |
 //!
 //! A NaN or infinity is never skipped: each mean over values that has one is itself NaN or infinite. Two fields can be
-//! finite all the same, so look at `nonfinite` too: the tone curve of `psnr` clips infinities, and `relmse_trimmed` counts
-//! NaN as worst of all, so that it may trim a few of them away.
+//! finite all the same, so look at `nonfinite` too: the tone curve of `psnr` clips infinities, and `relmse_trimmed`
+//! counts NaN as worst of all, so that it may trim a few of them away.
 
 /// Keeps relative errors of black pixels finite.
 pub const RELATIVE_FLOOR: f64 = 1e-2;

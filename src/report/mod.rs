@@ -6,8 +6,8 @@
 //! - [`rows`]: medians, the Pareto front, and how many plain samples would do as well.
 //! - [`table`], [`html`], [`plots`], [`svg`]: what a reader gets to see.
 //!
-//! Errors are reproducible: they depend on the samples, the method and the seed only, and are computed in `f64` with `+ - * /`,
-//! square roots and the pure-Rust `libm`. Times are what they are on the [`machine`].
+//! Errors are reproducible: they depend on the samples, the method and the seed only, and are computed in `f64` with `+
+//! - * /`, square roots and the pure-Rust `libm`. Times are what they are on the [`machine`].
 
 pub mod display;
 pub mod flip;

@@ -43,8 +43,8 @@ impl Key {
 
 /// Part of an image as an image of its own: no context around it. `tile` must have no halo and cover the part.
 ///
-/// Of each pixel the first `samples` samples are taken, in the order of the file, or all if it has no more: a render of s
-/// samples holds one of every smaller number.
+/// Of each pixel the first `samples` samples are taken, in the order of the file, or all if it has no more: a render of
+/// s samples holds one of every smaller number.
 pub fn subset(tile: &SampleTile, part: Rect, samples: u32) -> Result<SampleTile, SampleError> {
     let window = tile.geometry().window();
     let kept: Vec<_> = (part.y..part.bottom())

@@ -22,8 +22,9 @@ fn methods(rows: &[Row]) -> Vec<String> {
     each(rows, |row| row.label.clone())
 }
 
-/// relMSE against CPU seconds per megapixel: a panel for each data set and sample count, after one of the geometric means over
-/// them where there are several. Rows on one thread where there are such: more change neither error nor, much, CPU time.
+/// relMSE against CPU seconds per megapixel: a panel for each data set and sample count, after one of the geometric
+/// means over them where there are several. Rows on one thread where there are such: more change neither error nor,
+/// much, CPU time.
 pub fn error_time(rows: &[Row]) -> Vec<Panel> {
     let fewest = rows.iter().map(|row| row.key.threads).min().unwrap_or(1);
     let rows: Vec<Row> = rows.iter().filter(|row| row.key.threads == fewest).cloned().collect();
@@ -86,8 +87,8 @@ fn time_panel(title: String, y: &str, dots: Vec<(String, (f64, f64))>, methods: 
     Panel { title, x: "CPU seconds per megapixel".into(), y: y.into(), series: dots.chain([front]).collect() }
 }
 
-/// relMSE against samples per pixel, with the line that fits best and its slope: a panel for each data set that was measured at
-/// several sample counts.
+/// relMSE against samples per pixel, with the line that fits best and its slope: a panel for each data set that was
+/// measured at several sample counts.
 pub fn error_samples(rows: &[Row]) -> Vec<Panel> {
     let methods = methods(rows);
     let mut panels = Vec::new();

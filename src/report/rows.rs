@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 /// The preset that the others are compared with.
 pub const BASE: &str = "unfiltered";
 
-/// The reference's own error, where it is known. It is noise of zero mean and independent of the image, so that on average
-/// error against the reference = error against the truth + own error.
+/// The reference's own error, where it is known. It is noise of zero mean and independent of the image, so that on
+/// average error against the reference = error against the truth + own error.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Own {
     /// relMSE, 0 or more.

@@ -1,5 +1,5 @@
-//! Measurements that are done, one JSON object on a line: `{"key": …, "measurement": …}`. A report that was interrupted goes on
-//! from there; a line that was cut short is measured anew.
+//! Measurements that are done, one JSON object on a line: `{"key": …, "measurement": …}`. A report that was interrupted
+//! goes on from there; a line that was cut short is measured anew.
 
 use super::{measure::Measurement, plan::Key};
 use serde_json::{Value, json};
@@ -23,8 +23,8 @@ fn foreign(line: usize) -> io::Error {
 }
 
 impl State {
-    /// Opens a file, or makes it, and reads what is in it. A line that is not a measurement is an error, unless it is the last
-    /// and has no end.
+    /// Opens a file, or makes it, and reads what is in it. A line that is not a measurement is an error, unless it is
+    /// the last and has no end.
     pub fn open(path: &Path) -> io::Result<Self> {
         let mut file = OpenOptions::new().read(true).append(true).create(true).open(path)?;
         let mut text = String::new();

@@ -1,5 +1,5 @@
-//! Log-log charts as SVG: small panels in a grid with one legend. Plain text and shapes, readable on light and dark; the fonts
-//! are the reader's.
+//! Log-log charts as SVG: small panels in a grid with one legend. Plain text and shapes, readable on light and dark;
+//! the fonts are the reader's.
 
 use std::fmt::Write;
 

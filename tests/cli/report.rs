@@ -39,8 +39,8 @@ fn error_columns(csv: &str) -> String {
     csv.lines().map(|line| cells(line)[..end].join(";") + "\n").collect()
 }
 
-/// The errors are those of tests/report/small.csv to the last digit, on any machine; with RPFD_REGENERATE set that file is
-/// written anew.
+/// The errors are those of tests/report/small.csv to the last digit, on any machine; with RPFD_REGENERATE set that file
+/// is written anew.
 #[test]
 fn errors_are_as_recorded_to_the_last_digit() {
     let folder = Folder::new();

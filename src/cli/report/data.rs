@@ -98,8 +98,8 @@ fn digest(path: &Path) -> Result<String, Failure> {
     read().map_err(|error: std::io::Error| Failure::input("io", format!("{}: {error}", path.display())))
 }
 
-/// Every data set of a folder: NAME.NNspp.tiles[.zst] with NAME.reference.exr, and what reference-noise.json, where there is
-/// one, says of NAME.
+/// Every data set of a folder: NAME.NNspp.tiles[.zst] with NAME.reference.exr, and what reference-noise.json, where
+/// there is one, says of NAME.
 fn folder(path: &Path) -> Result<Vec<(DataArg, Own)>, Failure> {
     let fail = |error: &dyn std::fmt::Display| Failure::input("io", format!("{}: {error}", path.display()));
     let noise_path = path.join("reference-noise.json");

@@ -35,19 +35,19 @@ const STEPS: u64 = 1000;
 
 /// Measure error against run time
 ///
-/// Filters renders by every method, each image as one tile, and compares what comes out with the references. A render of s
-/// samples per pixel serves every smaller count: the first so many samples of each pixel are taken, in the order of the
-/// file. `unfiltered` is always among the methods, since the others are compared with it. Errors are the same whenever and
-/// wherever they are measured; times are those of this machine as it was.
+/// Filters renders by every method, each image as one tile, and compares what comes out with the references. A render
+/// of s samples per pixel serves every smaller count: the first so many samples of each pixel are taken, in the order
+/// of the file. `unfiltered` is always among the methods, since the others are compared with it. Errors are the same
+/// whenever and wherever they are measured; times are those of this machine as it was.
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct Args {
-    /// Samples, their reference, and the reference's own relMSE where it is known; files named NAME.NNspp.tiles[.zst] of one
-    /// NAME and reference are one data set
+    /// Samples, their reference, and the reference's own relMSE where it is known; files named NAME.NNspp.tiles[.zst]
+    /// of one NAME and reference are one data set
     #[arg(long, value_name = "TILES=REF.exr[:OWN_RELMSE]", value_parser = data::data_arg)]
     data: Vec<DataArg>,
-    /// Every NAME.NNspp.tiles[.zst] with NAME.reference.exr in a folder; reference-noise.json has the references' own errors:
-    /// {"NAME": {"relmse": ..., "mse": ...}}
+    /// Every NAME.NNspp.tiles[.zst] with NAME.reference.exr in a folder; reference-noise.json has the references' own
+    /// errors: {"NAME": {"relmse": ..., "mse": ...}}
     #[arg(long, value_name = "DIR")]
     folder: Vec<PathBuf>,
     /// A scene of `rpfd synth`, rendered here with its reference
@@ -56,7 +56,8 @@ pub(crate) struct Args {
     /// Samples per pixel of the references of --synth
     #[arg(long, value_name = "N", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(2..))]
     reference_spp: u32,
-    /// Method: a preset, with parameters if wanted (lean:bins=9,boxes=17,7); by default every preset, `paper` only with --crop
+    /// Method: a preset, with parameters if wanted (lean:bins=9,boxes=17,7); by default every preset, `paper` only with
+    /// --crop
     #[arg(long = "preset", value_name = "NAME[:K=V,...]")]
     presets: Vec<String>,
     /// Samples per pixel; by default as many as the files have, and 8 of --synth
@@ -72,8 +73,8 @@ pub(crate) struct Args {
     /// known; then `paper` is measured on the part only
     #[arg(long, value_name = "X,Y,W,H", value_parser = crop)]
     crop: Option<Rect>,
-    /// CPU seconds that rendering one sample per pixel takes per megapixel: adds the cost of samples and filter together,
-    /// and of the plain samples of equal error
+    /// CPU seconds that rendering one sample per pixel takes per megapixel: adds the cost of samples and filter
+    /// together, and of the plain samples of equal error
     #[arg(long, value_name = "S", value_parser = seconds)]
     seconds_per_sample: Option<f64>,
     /// Keys every random draw of the methods and of --synth
