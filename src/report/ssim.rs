@@ -1,10 +1,10 @@
 //! Structural similarity: Wang, Bovik, Sheikh, Simoncelli, *Image Quality Assessment: From Error Visibility to
 //! Structural Similarity*, IEEE TIP 13(4), 2004, equation 13 with the constants of section III-C.
 //!
-//! The variant: images are clipped to 0..1 and sRGB-encoded ([`srgb`](super::display::srgb)); luminance is Y = 0.2126 R
-//! + 0.7152 G + 0.0722 B of the encoded values; windows are 11 x 11 pixels, weighted by a Gaussian of standard
-//! deviation 1.5 pixels whose weights sum to 1; K1 = 0.01, K2 = 0.03, L = 1; variances are the weighted ones, without
-//! Bessel's correction; the mean is over the windows that lie inside the image. No downsampling.
+//! The variant: images are clipped to 0..1 and sRGB-encoded ([`srgb`](super::display::srgb)); luminance of the encoded
+//! values is Y = 0.2126 R + 0.7152 G + 0.0722 B; windows are 11 x 11 pixels, weighted by a Gaussian of standard deviation
+//! 1.5 pixels whose weights sum to 1; K1 = 0.01, K2 = 0.03, L = 1; variances are the weighted ones, without Bessel's
+//! correction; the mean is over the windows that lie inside the image. No downsampling.
 
 use super::display::convolve;
 
