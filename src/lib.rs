@@ -10,7 +10,7 @@
 //! - `service`: tiles in, results and images out, over HTTP.
 //! - `stitch`: the image being assembled from filtered tiles, and OpenEXR files.
 //! - `picture`: PNG pictures of linear images, alone and side by side.
-//! - `report`: how far an image is from its reference; stiff and extreme cases.
+//! - `report`: how far an image is from its reference, and what that took; stiff and extreme cases.
 //! - `store`: samples on disk, from which tiles of any size are cut.
 //! - `wire`: tiles and results as MessagePack, without I/O, and files of tiles.
 //! - `client`: HTTP client of the service, with retries.

@@ -19,6 +19,7 @@ mod input;
 mod inspect;
 mod post;
 mod progress;
+mod report;
 mod schedule;
 mod serve;
 mod stability;
@@ -43,6 +44,7 @@ Examples:
   rpfd demo                                       see it work, on a real render
   rpfd inspect render.tiles.zst                   what is in a file, and what is wrong with it
   rpfd filter render.tiles.zst -o render.exr      denoise a file
+  rpfd report --folder renders --html report.html error against run time, as a page
   rpfd serve --listen 0.0.0.0:8080                run the service
   rpfd post render.tiles.zst --to http://HOST:8080 -o render.exr
                                                   denoise a file by the service";
@@ -53,6 +55,7 @@ enum Command {
     Filter(Box<filter::Args>),
     Inspect(inspect::Args),
     Post(Box<post::Args>),
+    Report(Box<report::Args>),
     Serve(serve::Args),
     Stability(stability::Args),
     Synth(synth::Args),
@@ -65,6 +68,7 @@ pub fn main() -> ExitCode {
         Command::Filter(args) => (args.json, filter::run(&args)),
         Command::Inspect(args) => (args.json, inspect::run(&args)),
         Command::Post(args) => (args.json, post::run(&args)),
+        Command::Report(args) => (args.json_errors(), report::run(&args)),
         Command::Serve(args) => (false, serve::run(args)),
         Command::Stability(args) => (args.json, stability::run(&args)),
         Command::Synth(args) => (args.json, synth::run(&args)),

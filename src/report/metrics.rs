@@ -13,11 +13,11 @@
 //! | `nonfinite` | values of x that are infinite or NaN |
 //!
 //! A NaN or infinity is never skipped: each mean over values that has one is itself NaN or infinite. Two fields can be
-//! finite all the same, so look at `nonfinite` too: the tone curve of `psnr` clips infinities, and `relmse_trimmed` counts
-//! NaN as worst of all, so that it may trim a few of them away.
+//! finite all the same, so look at `nonfinite` too: the tone curve of `psnr` clips infinities, and `relmse_trimmed`
+//! counts NaN as worst of all, so that it may trim a few of them away.
 
 /// Keeps relative errors of black pixels finite.
-const RELATIVE_FLOOR: f64 = 1e-2;
+pub const RELATIVE_FLOOR: f64 = 1e-2;
 
 /// The share of pixels that `relmse_trimmed` looks at.
 const KEPT: f64 = 0.999;
@@ -87,7 +87,7 @@ pub fn errors(image: &[[f32; 3]], reference: &[[f32; 3]]) -> Result<Errors, Size
         mse: square / values,
         relmse,
         relmse_trimmed: relative[..kept].iter().sum::<f64>() / kept as f64,
-        psnr: if tone_mse.is_nan() { f64::NAN } else { -10.0 * tone_mse.max(1e-20).log10() },
+        psnr: if tone_mse.is_nan() { f64::NAN } else { -10.0 * libm::log10(tone_mse.max(1e-20)) },
         smape: relative_abs / values,
         energy: energy / reference_energy,
         nonfinite,
@@ -96,7 +96,7 @@ pub fn errors(image: &[[f32; 3]], reference: &[[f32; 3]]) -> Result<Errors, Size
 
 /// NaN stays NaN.
 fn tone(value: f64) -> f64 {
-    value.clamp(0.0, 1.0).powf(1.0 / 2.2)
+    libm::pow(value.clamp(0.0, 1.0), 1.0 / 2.2)
 }
 
 #[cfg(test)]

@@ -108,7 +108,7 @@ fn bad_usage_exits_with_2_and_says_what_would_be_right() {
 
 #[test]
 fn help_and_version_exit_with_0() {
-    for command in ["demo", "filter", "inspect", "post", "synth"] {
+    for command in ["demo", "filter", "inspect", "post", "report", "synth"] {
         let output = rpfd([command, "--help"]);
         assert_eq!(output.status.code(), Some(0));
         let help = String::from_utf8(output.stdout).unwrap();

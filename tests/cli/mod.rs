@@ -5,6 +5,7 @@ mod failures;
 mod filter;
 mod inspect;
 mod post;
+mod report;
 mod stability;
 mod synth;
 

@@ -1,0 +1,246 @@
+//! The rows as text, CSV and JSON. Units are in the headings: seconds per megapixel of the image, MiB, dB.
+
+use super::{
+    machine::Machine,
+    rows::{Row, Slope, Spread},
+    scores::{COLUMNS, number},
+};
+use serde_json::{Value, json};
+use std::fmt::Write;
+
+/// Significant digits enough to compare by eye.
+pub fn short(value: f64) -> String {
+    let size = value.abs();
+    match size {
+        _ if !value.is_finite() => value.to_string(),
+        0.0 => "0".to_owned(),
+        1e6.. => format!("{value:.2e}"),
+        100.0.. => format!("{value:.0}"),
+        10.0.. => format!("{value:.1}"),
+        1.0.. => format!("{value:.2}"),
+        1e-4.. => format!("{value:.*}", (2 - size.log10().floor() as i32).clamp(0, 9) as usize),
+        _ => format!("{value:.2e}"),
+    }
+}
+
+/// Median, and the least and greatest where it was measured several times.
+pub fn spread(spread: &Spread, repeats: usize) -> String {
+    let Spread { median, min, max } = spread;
+    match repeats {
+        1 => short(*median),
+        _ => format!("{} ({}-{})", short(*median), short(*min), short(*max)),
+    }
+}
+
+fn mebibytes(bytes: u64) -> String {
+    short(bytes as f64 / f64::from(1 << 20))
+}
+
+/// The headings and cells to read; `seconds_per_sample` is what a sample per pixel takes to render, per megapixel.
+pub fn cells(rows: &[Row], seconds_per_sample: Option<f64>) -> (Vec<&'static str>, Vec<Vec<String>>) {
+    let mut headings = vec![
+        "data set",
+        "spp",
+        "method",
+        "threads",
+        "relMSE",
+        "trimmed",
+        "MSE",
+        "PSNR dB",
+        "SMAPE",
+        "SSIM",
+        "FLIP",
+        "energy",
+        "non-finite",
+        "CPU s/Mpx",
+        "wall s/Mpx",
+        "plan MiB",
+        "peak MiB",
+        "front",
+        "equal spp",
+    ];
+    if seconds_per_sample.is_some() {
+        headings.extend(["total s/Mpx", "plain s/Mpx", "plain relMSE"]);
+    }
+    let cells = rows.iter().map(|row| {
+        let score = |name| short(row.scores.get(name));
+        let mut cells = vec![
+            row.key.data.clone(),
+            row.key.spp.to_string(),
+            row.label.clone(),
+            row.key.threads.to_string(),
+            short(row.relmse()),
+            score("relmse_trimmed"),
+            short(row.mse()),
+            format!("{:.2}", row.scores.get("psnr")),
+            score("smape"),
+            format!("{:.4}", row.scores.get("ssim")),
+            format!("{:.4}", row.scores.get("flip")),
+            format!("{:.4}", row.scores.get("energy")),
+            row.scores.get("nonfinite").to_string(),
+            spread(&row.cpu, row.repeats),
+            spread(&row.wall, row.repeats),
+            mebibytes(row.planned),
+            row.peak.map_or_else(|| "-".to_owned(), mebibytes),
+            if row.pareto { "yes" } else { "" }.to_owned(),
+            row.equal_spp.map_or_else(|| "-".to_owned(), short),
+        ];
+        if let Some(seconds) = seconds_per_sample {
+            cells.push(short(row.cost(seconds)));
+            cells.push(row.equal_spp.map_or_else(|| "-".to_owned(), |spp| short(spp * seconds)));
+            cells.push(row.plain_relmse(seconds).map_or_else(|| "-".to_owned(), short));
+        }
+        cells
+    });
+    (headings, cells.collect())
+}
+
+/// A table of fixed-width text.
+pub fn text(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
+    let (headings, cells) = cells(rows, seconds_per_sample);
+    let width = |column: usize| {
+        let widths = cells.iter().map(|row| row[column].chars().count());
+        widths.chain([headings[column].chars().count()]).max().unwrap_or(0)
+    };
+    let widths: Vec<usize> = (0..headings.len()).map(width).collect();
+    let mut out = String::new();
+    let mut line = |cells: &[&str]| {
+        let padded = cells.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| match column {
+            0 | 2 => format!("{cell:<width$}"),
+            _ => format!("{cell:>width$}"),
+        });
+        let _ = writeln!(out, "{}", padded.collect::<Vec<_>>().join("  ").trim_end());
+    };
+    line(&headings);
+    cells.iter().for_each(|row| line(&row.iter().map(String::as_str).collect::<Vec<_>>()));
+    out
+}
+
+/// What the headings of [`cells`] mean.
+pub const NOTES: [&str; 6] = [
+    "relMSE and MSE are less the reference's own error where that is known; the trimmed relMSE is not.",
+    "CPU and wall: seconds of the filter alone per megapixel (10^6 pixels), over all threads and by the clock; the median of \
+     the repeats (least-greatest).",
+    "plan: what the filter said it would need, samples included; peak: greatest resident size of the whole process meanwhile; \
+     both in MiB (2^20 bytes), for the image as one tile.",
+    "front: no other method on the same data set, samples and threads has both less relMSE and less CPU time.",
+    "equal spp: plain samples per pixel whose mean would have the same relMSE, from the unfiltered error's slope: measured \
+     where there are several sample counts, else -1.",
+    "total, plain: CPU seconds per megapixel to render the samples and filter them, and to render the plain samples of equal \
+     error; plain relMSE: that of as many plain samples as could be rendered in the total time.",
+];
+
+/// All numbers with all their digits, one row on a line (RFC 4180). Empty is unknown.
+pub fn csv(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
+    let columns = COLUMNS.iter().map(|column| column.name);
+    let mut out = ["data", "crop", "spp", "method", "parameters", "threads", "seed"]
+        .into_iter()
+        .chain(columns)
+        .collect::<Vec<_>>()
+        .join(",");
+    out += ",relmse_less_own,mse_less_own,own_relmse,own_mse,repeats,cpu_s_per_mpx,cpu_s_per_mpx_min,cpu_s_per_mpx_max,\
+            wall_s_per_mpx,wall_s_per_mpx_min,wall_s_per_mpx_max,planned_bytes,peak_resident_bytes,pareto,\
+            unfiltered_slope,slope_is,equal_spp,total_s_per_mpx,plain_s_per_mpx,plain_relmse_at_total\n";
+    for row in rows {
+        let known = |value: Option<f64>| value.map(|value| value.to_string()).unwrap_or_default();
+        let mut cells = vec![
+            quoted(&row.key.data),
+            row.key.crop.map(|v| v.to_string()).join(" "),
+            row.key.spp.to_string(),
+            quoted(&row.label),
+            quoted(&row.key.parameters.join(" ")),
+            row.key.threads.to_string(),
+            row.key.seed.to_string(),
+        ];
+        cells.extend(row.scores.0.iter().map(f64::to_string));
+        cells.extend([row.relmse(), row.mse()].map(|v| v.to_string()));
+        cells.extend([known(row.own.relmse), known(row.own.mse), row.repeats.to_string()]);
+        for Spread { median, min, max } in [row.cpu, row.wall] {
+            cells.extend([median, min, max].map(|v| v.to_string()));
+        }
+        cells.push(row.planned.to_string());
+        cells.push(row.peak.map(|peak| peak.to_string()).unwrap_or_default());
+        cells.push(row.pareto.to_string());
+        cells.push(row.slope.value().to_string());
+        cells.push(slope_is(row.slope).to_owned());
+        cells.push(known(row.equal_spp));
+        cells.push(known(seconds_per_sample.map(|seconds| row.cost(seconds))));
+        cells.push(known(seconds_per_sample.and_then(|seconds| Some(seconds * row.equal_spp?))));
+        cells.push(known(seconds_per_sample.and_then(|seconds| row.plain_relmse(seconds))));
+        out += &cells.join(",");
+        out += "\n";
+    }
+    out
+}
+
+const fn slope_is(slope: Slope) -> &'static str {
+    match slope {
+        Slope::Fitted(_) => "fitted",
+        Slope::Assumed => "assumed",
+    }
+}
+
+fn quoted(text: &str) -> String {
+    if text.contains([',', '"', '\r', '\n']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.to_owned() }
+}
+
+/// All numbers as JSON; what JSON has no numbers for is in words, and what is unknown `null`.
+pub fn json(rows: &[Row], seconds_per_sample: Option<f64>, machine: &Machine) -> Value {
+    let spread = |Spread { median, min, max }: Spread| json!({ "median": median, "min": min, "max": max });
+    let one = |row: &Row| {
+        json!({
+            "data": row.key.data,
+            "crop": row.key.crop,
+            "spp": row.key.spp,
+            "method": row.label,
+            "preset": row.key.preset,
+            "parameters": row.key.parameters,
+            "threads": row.key.threads,
+            "seed": row.key.seed,
+            "errors": row.scores.to_json(),
+            "relmse_less_own": number(row.relmse()),
+            "mse_less_own": number(row.mse()),
+            "own_relmse": row.own.relmse,
+            "own_mse": row.own.mse,
+            "repeats": row.repeats,
+            "repeatable": row.repeatable,
+            "cpu_seconds_per_megapixel": spread(row.cpu),
+            "wall_seconds_per_megapixel": spread(row.wall),
+            "planned_bytes": row.planned,
+            "peak_resident_bytes": row.peak,
+            "pareto": row.pareto,
+            "unfiltered_slope": { "value": row.slope.value(), "is": slope_is(row.slope) },
+            "equal_spp": row.equal_spp,
+            "total_seconds_per_megapixel": seconds_per_sample.map(|seconds| row.cost(seconds)),
+            "plain_seconds_per_megapixel": seconds_per_sample.and_then(|seconds| Some(seconds * row.equal_spp?)),
+            "plain_relmse_at_total": seconds_per_sample.and_then(|seconds| row.plain_relmse(seconds)),
+        })
+    };
+    let formulas = COLUMNS.iter().map(|c| (c.name.to_owned(), c.formula.into())).collect::<serde_json::Map<_, _>>();
+    json!({
+        "machine": machine,
+        "formulas": formulas,
+        "seconds_per_sample_per_megapixel": seconds_per_sample,
+        "rows": rows.iter().map(one).collect::<Vec<_>>(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_short() {
+        let known =
+            [(0.0, "0"), (0.012345, "0.0123"), (0.5, "0.500"), (3.1234, "3.12"), (31.4159, "31.4"), (31415.9, "31416")];
+        for (value, expected) in known.into_iter().chain([(1e-7, "1.00e-7"), (f64::NAN, "NaN"), (-0.0123, "-0.0123")]) {
+            assert_eq!(short(value), expected);
+        }
+    }
+
+    #[test]
+    fn csv_quotes_what_needs_it() {
+        assert_eq!(quoted("a b"), "a b");
+        assert_eq!(quoted("a,\"b\""), "\"a,\"\"b\"\"\"");
+    }
+}

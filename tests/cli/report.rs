@@ -1,0 +1,240 @@
+//! `rpfd report`: errors that are the same whenever they are measured, and what is written about them.
+
+use super::*;
+use std::collections::BTreeMap;
+
+/// A crop of a render, with its reference.
+fn small() -> String {
+    format!("{}={}:2e-4", data("small.tiles.zst").display(), data("small.reference.exr").display())
+}
+
+/// The methods are named, so that a new preset changes nothing here.
+const METHODS: [&str; 4] = ["--preset", "lean", "--preset", "lean:boxes=11,7,bins=9"];
+
+fn measure(folder: &Folder, csv: &str, more: &[&str]) -> (Output, String) {
+    let (small, csv) = (small(), folder.path(csv));
+    let args = ["report", "--data", &small, "--synth", "all@48x48", "--reference-spp", "32", "--csv", &csv];
+    let output = rpfd(args.iter().chain(&METHODS).chain(more));
+    assert!(output.status.success(), "{}", stderr(&output));
+    (output, std::fs::read_to_string(csv).unwrap())
+}
+
+/// The cells of a line; only the methods have commas in them.
+fn cells(line: &str) -> Vec<String> {
+    let (mut cells, mut inside) = (vec![String::new()], false);
+    for c in line.chars() {
+        match c {
+            '"' => inside = !inside,
+            ',' if !inside => cells.push(String::new()),
+            c => cells.last_mut().unwrap().push(c),
+        }
+    }
+    cells
+}
+
+/// What a CSV has ahead of the times: data, method, and every error.
+fn error_columns(csv: &str) -> String {
+    let end = cells(csv.lines().next().unwrap()).iter().position(|name| name == "repeats").unwrap();
+    assert_eq!(end, 20);
+    csv.lines().map(|line| cells(line)[..end].join(";") + "\n").collect()
+}
+
+/// The errors are those of tests/report/small.csv to the last digit, on any machine; with RPFD_REGENERATE set that file
+/// is written anew.
+#[test]
+fn errors_are_as_recorded_to_the_last_digit() {
+    let folder = Folder::new();
+    let (_, one) = measure(&folder, "one.csv", &["--spp", "1,2,4", "--crop", "8,8,24,24"]);
+    let (_, two) = measure(&folder, "two.csv", &["--spp", "4,2,1", "--crop", "8,8,24,24", "--repeats", "2"]);
+    assert_eq!(error_columns(&one), error_columns(&two));
+    let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/report/small.csv");
+    if std::env::var_os("RPFD_REGENERATE").is_some() {
+        std::fs::write(&golden, error_columns(&one)).unwrap();
+    }
+    let golden = std::fs::read_to_string(golden).unwrap();
+    assert_eq!(golden.lines().count(), 1 + 2 * 2 * 3 * 3);
+    for (got, expected) in error_columns(&one).lines().zip(golden.lines()) {
+        assert_eq!(got, expected, "to record these errors, run with RPFD_REGENERATE=1");
+    }
+    assert_eq!(error_columns(&one).lines().count(), golden.lines().count());
+}
+
+#[test]
+fn threads_change_no_error() {
+    let folder = Folder::new();
+    let (_, csv) = measure(&folder, "out.csv", &["--spp", "2", "--threads", "1,2"]);
+    let mut rows: BTreeMap<[String; 2], Vec<Vec<String>>> = BTreeMap::new();
+    for line in error_columns(&csv).lines().skip(1) {
+        let mut cells: Vec<String> = line.split(';').map(str::to_owned).collect();
+        cells.remove(5);
+        rows.entry([cells[0].clone(), cells[3].clone()]).or_default().push(cells);
+    }
+    assert_eq!(rows.len(), 6);
+    assert!(rows.values().all(|same| same.len() == 2 && same[0] == same[1]));
+}
+
+#[test]
+fn what_is_measured_is_not_measured_again() {
+    let folder = Folder::new();
+    let state = folder.path("report.state");
+    let (_, one) = measure(&folder, "one.csv", &["--spp", "2", "--state", &state]);
+    let lines = |text: &str| text.lines().count();
+    let kept = String::from_utf8(bytes(&state)).unwrap();
+    assert_eq!(lines(&kept), 6);
+    // The times are the same as well: nothing was measured.
+    let (_, two) = measure(&folder, "two.csv", &["--spp", "2", "--state", &state]);
+    assert_eq!(one, two);
+    assert_eq!(String::from_utf8(bytes(&state)).unwrap(), kept);
+    // The last line was cut short: it is measured again, and only it.
+    std::fs::write(&state, &kept[..kept.len() - 20]).unwrap();
+    let (_, three) = measure(&folder, "three.csv", &["--spp", "2", "--state", &state]);
+    assert_eq!(error_columns(&one), error_columns(&three));
+    let again = String::from_utf8(bytes(&state)).unwrap();
+    assert_eq!(lines(&again), 6);
+    assert!(again.lines().zip(kept.lines()).take(5).all(|(a, b)| a == b));
+    // What else is asked for is added; another seed is another measurement.
+    measure(&folder, "four.csv", &["--spp", "2,4", "--state", &state, "--repeats", "2"]);
+    assert_eq!(lines(&String::from_utf8(bytes(&state)).unwrap()), 24);
+    measure(&folder, "five.csv", &["--spp", "2", "--state", &state, "--seed", "1"]);
+    assert_eq!(lines(&String::from_utf8(bytes(&state)).unwrap()), 30);
+}
+
+#[test]
+fn a_file_that_is_no_state_is_left_alone() {
+    let folder = Folder::new();
+    let (small, notes) = (small(), folder.path("notes.txt"));
+    for text in ["remember the milk", "remember\nthe milk\n", "{}\n", "{\"key\": 1, \"measurement\": 2}\n"] {
+        std::fs::write(&notes, text).unwrap();
+        let (code, message) = fails(3, ["report", "--data", &small, "--state", &notes]);
+        assert!(code == "bad_state" && message.contains("notes.txt"), "{message}");
+        assert_eq!(bytes(&notes), text.as_bytes());
+    }
+}
+
+#[test]
+fn the_page_needs_nothing_else_and_has_every_row() {
+    let folder = Folder::new();
+    let [html, svg, json] = ["report.html", "plot.svg", "report.json"].map(|name| folder.path(name));
+    let outputs = ["--html", &html, "--svg", &svg, "--json", &json, "--spp", "1,4", "--seconds-per-sample", "3"];
+    let (output, csv) = measure(&folder, "out.csv", &outputs);
+    assert!(stderr(&output).is_empty(), "a bar where nobody is looking: {}", stderr(&output));
+    let [page, plot, numbers] = [&html, &svg, &json].map(|path| String::from_utf8(bytes(path)).unwrap());
+    for text in [&page, &plot] {
+        let links = text.replace("http://www.w3.org/2000/svg", "");
+        for outside in ["http:", "https:", "//cdn", "<script", "<link", "@import", "url(", "file:", "src=\"/"] {
+            assert!(!links.contains(outside), "{outside}");
+        }
+    }
+    assert_eq!(page.matches("<tr class=").count() + page.matches("<tr><td>").count(), 12);
+    let numbers: Value = serde_json::from_str(&numbers).unwrap();
+    let rows = numbers["rows"].as_array().unwrap();
+    assert_eq!((rows.len(), csv.lines().count()), (12, 13));
+    let table = String::from_utf8(output.stdout).unwrap();
+    for (row, line) in rows.iter().zip(csv.lines().skip(1)) {
+        let cells = cells(line);
+        assert_eq!((&row["data"], &row["method"]), (&cells[0].as_str().into(), &cells[3].as_str().into()));
+        assert_eq!(row["errors"]["relmse"].to_string().parse::<f64>().unwrap(), cells[8].parse::<f64>().unwrap());
+        let spp = row["spp"].as_u64().unwrap();
+        let start = format!("<td>{}</td><td>{spp}</td><td>{}</td>", cells[0], cells[3]);
+        assert!(page.contains(&start), "{start}");
+        assert!(table.lines().any(|line| line.starts_with(&cells[0]) && line.contains(&cells[3])));
+        // Samples and filter, and the plain samples of the same error.
+        let cpu = row["cpu_seconds_per_megapixel"]["median"].as_f64().unwrap();
+        assert_eq!(row["total_seconds_per_megapixel"].as_f64().unwrap(), 3.0 * spp as f64 + cpu);
+        assert_eq!(row["unfiltered_slope"]["is"], "fitted");
+        if row["preset"] == "unfiltered" {
+            assert!((row["equal_spp"].as_f64().unwrap() - spp as f64).abs() < 1e-9);
+        }
+    }
+    for part in
+        ["ε = 0.01", "prefers-color-scheme", "data:image/png;base64,", "reference", "difference", "SIMD", "slope"]
+    {
+        assert!(page.contains(part), "{part}");
+    }
+    assert_eq!(numbers["machine"]["version"], format!("rpfd {}", env!("CARGO_PKG_VERSION")));
+}
+
+/// A render in a folder serves its own number of samples, and fewer; what it has not is left out, and said.
+#[test]
+fn a_folder_of_renders() {
+    let folder = Folder::new();
+    for (name, spp) in [("a.2spp.tiles", "2"), ("a.6spp.tiles.zst", "6")] {
+        let reference = folder.path("a.reference.exr");
+        let args =
+            ["--size", "20x16", "--spp", spp, "--reference", &reference, "--reference-spp", "16", "--scene", "plain"];
+        folder.synth(name, &args);
+    }
+    std::fs::write(folder.path("reference-noise.json"), r#"{"a": {"relmse": 0.001, "mse": 0.002}}"#).unwrap();
+    let here = folder.path("");
+    let said = |more: &[&str]| {
+        let report = json(["report", "--folder", &here, "--preset", "unfiltered"].iter().chain(more));
+        let rows = report["rows"].as_array().unwrap().clone();
+        rows.iter().map(|r| (r["spp"].as_u64().unwrap(), r["errors"]["relmse"].as_f64().unwrap())).collect::<Vec<_>>()
+    };
+    let own = said(&[]);
+    assert_eq!(own.iter().map(|row| row.0).collect::<Vec<_>>(), [2, 6]);
+    // The samples of synth are the same whatever their number, so it does not matter which file serves.
+    let all = said(&["--spp", "1,2,4,6"]);
+    assert_eq!(all.iter().map(|row| row.0).collect::<Vec<_>>(), [1, 2, 4, 6]);
+    assert_eq!([all[1], all[3]], [own[0], own[1]]);
+    let output = rpfd(["report", "--folder", &here, "--preset", "unfiltered", "--spp", "2,64"]);
+    assert!(output.status.success() && stderr(&output).contains("fewer than 64"));
+    let row = &json(["report", "--folder", &here, "--spp", "2", "--preset", "unfiltered"])["rows"][0];
+    assert_eq!((&row["own_relmse"], &row["own_mse"]), (&0.001.into(), &0.002.into()));
+    assert_eq!(row["relmse_less_own"].as_f64().unwrap(), row["errors"]["relmse"].as_f64().unwrap() - 0.001);
+    // SSIM has no window here.
+    assert_eq!(fails(2, ["report", "--folder", &here, "--spp", "64"]).0, "no_data");
+}
+
+#[test]
+fn an_image_without_an_ssim_window_has_none() {
+    let row = &json(["report", "--synth", "plain@8x8", "--reference-spp", "4", "--preset", "unfiltered"])["rows"][0];
+    assert_eq!(row["errors"]["ssim"], "NaN");
+    assert!(row["errors"]["flip"].as_f64().unwrap() > 0.0);
+}
+
+#[test]
+fn bad_usage_and_bad_input_are_told_apart() {
+    let folder = Folder::new();
+    let (small, here) = (small(), folder.path(""));
+    for (args, code) in [
+        (&["report"][..], "no_data"),
+        (&["report", "--data", &small, "--preset", "leen"], "parameter"),
+        (&["report", "--data", &small, "--preset", "lean:boxs=3"], "parameter"),
+        (&["report", "--data", &small, "--preset", "lean:7"], "parameter"),
+        (&["report", "--data", &small, "--crop", "40,40,9,9"], "crop"),
+        (&["report", "--data", &small, "--spp", "5"], "no_data"),
+        (&["report", "--data", &small, "--data", &small], "data"),
+    ] {
+        let (got, message) = fails(2, args);
+        assert_eq!(got, code, "{args:?}: {message}");
+    }
+    for args in [
+        &["--data", "a.tiles"][..],
+        &["--data", "a.tiles=b.exr:lots"],
+        &["--synth", "all"],
+        &["--synth", "nothing@8x8"],
+        &["--spp", "0"],
+        &["--spp", "4,x"],
+        &["--threads", "0"],
+        &["--repeats", "0"],
+        &["--crop", "1,2,3"],
+        &["--crop", "1,2,0,3"],
+        &["--seconds-per-sample", "0"],
+    ] {
+        let output = rpfd(["report"].iter().chain(args));
+        assert_eq!(output.status.code(), Some(2), "{args:?}");
+        assert!(stderr(&output).contains(args[0]), "{}", stderr(&output));
+    }
+    let (tiles, reference) = (data("small.tiles.zst"), data("depth_of_field.reference.exr"));
+    let wrong = format!("{}={}", tiles.display(), reference.display());
+    assert_eq!(fails(3, ["report", "--data", &wrong]).0, "picture_size");
+    assert_eq!(fails(3, ["report", "--data", "nowhere.tiles=nowhere.exr"]).0, "not_found");
+    assert_eq!(fails(3, ["report", "--folder", &here]).0, "io");
+    // Before the work, and without a trace.
+    let nowhere = folder.path("nowhere/out");
+    for output in ["--csv", "--html", "--svg", "--state"] {
+        assert_eq!(fails(1, ["report", "--data", &small, output, &nowhere]).0, "output_io");
+    }
+    assert_eq!(folder.names(), [""; 0]);
+}
