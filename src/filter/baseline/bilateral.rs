@@ -1,7 +1,7 @@
 //! A bilateral filter of pixels (eq. 3, 4): b(p) = sum_q f(q) D(p-q) R(f(p)-f(q)) / sum_q D(p-q) R(f(p)-f(q)).
 //!
 //! C. Tomasi and R. Manduchi, *Bilateral Filtering for Gray and Color Images*, ICCV 1998. D is the Gaussian of
-//! [`gaussian`](super::gaussian), cut off in the same way, and R(d) = exp(-|d|^2 / (2 color_sigma^2)). The thesis paper
+//! [`gaussian`], cut off in the same way, and R(d) = exp(-|d|^2 / (2 color_sigma^2)). The thesis paper
 //! prints a *sum* of squares in R where Tomasi and Manduchi have the difference; the difference it is.
 //!
 //! d is the Euclidean distance of two pixels' means in linear R, G, B. (Tomasi and Manduchi measure in CIE-Lab, which is

@@ -1,4 +1,4 @@
-//! A cross-bilateral filter of pixels: the bilateral filter of [`bilateral`](super::bilateral) with a further Gaussian
+//! A cross-bilateral filter of pixels: the bilateral filter of [`bilateral`] with a further Gaussian
 //! over the difference of every feature.
 //!
 //! E. Eisemann and F. Durand, *Flash Photography Enhancement via Intrinsic Relighting*, and G. Petschnigg et al., *Digital
