@@ -56,8 +56,10 @@ fn filter_block<S: Simd, const N: usize>(simd: S, distances: &Distances, first: 
                 *distance += difference * difference;
             }
         }
-        let colors: [Lanes<S>; 3] =
-            std::array::from_fn(|k| Lanes::from_slice(simd, &radiance[k * stride + start..][..LANES]));
+        let mut colors = [zero; 3];
+        for (k, color) in colors.iter_mut().enumerate() {
+            *color = Lanes::from_slice(simd, &radiance[k * stride + start..][..LANES]);
+        }
         for n in 0..N {
             let weight = keep_first(simd, exp_neg(simd, distance[n]), rows - start);
             weights[n] += weight;
@@ -69,7 +71,7 @@ fn filter_block<S: Simd, const N: usize>(simd: S, distances: &Distances, first: 
     for (n, out) in out.chunks_exact_mut(3).enumerate() {
         let weight = sum(weights[n]);
         for k in 0..3 {
-            let Span { min, max, scale } = spans[k];
+            let Span { min, max, scale, .. } = spans[k];
             // The mean lies between the least and the greatest value; rounding must not take it out, nor to infinity.
             let mean = (sum(sums[n][k]) / weight).max(min * scale).min(max * scale);
             // What underflows to -0 becomes 0.

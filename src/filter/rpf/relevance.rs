@@ -21,8 +21,6 @@ pub(crate) struct Feature {
     pub(crate) plane: usize,
     /// Whether it is a world position.
     pub(crate) position: bool,
-    /// Whether any sample lacks it.
-    pub(crate) missing: bool,
 }
 
 /// The planes that matter, by role.
@@ -50,13 +48,7 @@ impl Relevant {
             match channel.role {
                 Role::Film => found.positions.push(Source::Plane(plane)),
                 Role::Color => {}
-                Role::Feature { position } => {
-                    let missing = match tile.plane(plane) {
-                        Plane::Constant(value) => value.is_nan(),
-                        Plane::Values(values) => values.iter().any(|v| v.is_nan()),
-                    };
-                    found.features.push(Feature { plane, position, missing });
-                }
+                Role::Feature { position } => found.features.push(Feature { plane, position }),
                 Role::Random { .. } => found.random.push(plane),
             }
         }

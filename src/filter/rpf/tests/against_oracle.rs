@@ -5,10 +5,11 @@ use super::{is_feature, method, scene};
 use crate::filter::lanes::{SimdLevel, dispatch};
 use crate::filter::method::Algorithm;
 use crate::filter::oracle::{self, Columns, Whole};
-use crate::filter::rpf::iteration::{ColumnOrder, Pass, Scratch};
+use crate::filter::rpf::block::ColumnOrder;
+use crate::filter::rpf::iteration::{Pass, Scratch};
 use crate::filter::rpf::neighborhood::Offsets;
 use crate::filter::rpf::relevance::{Relevant, Source};
-use crate::filter::rpf::{Params, draws, information, interleaved_colors, most_rows, spikes};
+use crate::filter::rpf::{Params, draws, information, interleaved_colors, room, spikes};
 use crate::filter::{ChannelSet, Counts, Execution, Rect, Role, SampleTile, TileGeometry};
 use crate::synth::Scene;
 
@@ -53,9 +54,12 @@ fn params(preset: &str, settings: &[(&str, &str)]) -> Params {
 /// Runs `compare` at some pixels of a noisy scene, in each iteration, with all that a pass has.
 fn at_pixels(params: &Params, tile: &SampleTile, mut compare: impl FnMut(&Pass, &mut Scratch, u32, u32)) {
     let relevant = Relevant::of(tile, true);
-    let rows = most_rows(params, tile.max_per_pixel() as usize);
-    let (terms, colors) = (information::entropy_terms(rows), interleaved_colors(tile));
-    let mut scratch = Scratch::new(&relevant, rows, params.bins, true);
+    let mut room = room(tile.geometry(), params, tile.total() as u64, tile.max_per_pixel(), tile.varying());
+    // The whole image as one block, so that records are numbered like the tile's samples.
+    let window = tile.geometry().window();
+    (room.pixels, room.samples) = (window.area() as usize, tile.total());
+    let (terms, colors) = (information::entropy_terms(room.rows), interleaved_colors(tile));
+    let mut scratch = Scratch::new(tile, &relevant, params, &room, true);
     for t in 0..params.boxes.len() {
         let offsets = Offsets::new(params.boxes[t]);
         let execution = Execution { seed: 3, ..Execution::default() };
@@ -69,7 +73,7 @@ fn at_pixels(params: &Params, tile: &SampleTile, mut compare: impl FnMut(&Pass, 
             terms: &terms,
             colors: &colors,
         };
-        let window = tile.geometry().window();
+        dispatch!(SimdLevel::default().level(), simd => pass.load(simd, &mut scratch, &window, true));
         for y in (0..window.height).step_by(5) {
             for x in (0..window.width).step_by(7) {
                 compare(&pass, &mut scratch, x, y);
@@ -88,7 +92,7 @@ fn cases() -> Vec<(Params, SampleTile)> {
 
 /// The neighbourhood's raw columns, as the oracle takes them.
 fn raw_columns(pass: &Pass, scratch: &Scratch) -> Columns {
-    let samples = &scratch.rows.samples;
+    let samples = scratch.rows();
     let plane = |plane: usize| samples.iter().map(|&s| f64::from(pass.tile.value(plane, s as usize))).collect();
     let positions = pass.relevant.positions().iter().map(|source| match source {
         Source::Plane(p) => plane(*p),
@@ -104,14 +108,16 @@ fn raw_columns(pass: &Pass, scratch: &Scratch) -> Columns {
 }
 
 /// The fast path's normalised columns.
-fn fast_columns(pass: &Pass, scratch: &Scratch) -> Columns {
-    let (order, rows) = (ColumnOrder::of(pass.relevant), scratch.rows.samples.len());
-    let column = |c: usize| f64s(&scratch.columns[c * scratch.stride..][..rows]);
+fn fast_columns(pass: &Pass, scratch: &mut Scratch) -> Columns {
+    let (order, rows) = (ColumnOrder::of(pass.relevant), scratch.rows().len());
+    let mut columns = |columns: std::ops::Range<usize>| {
+        columns.map(|column| f64s(&scratch.columns([column])[0][..rows])).collect::<Vec<_>>()
+    };
     Columns {
-        positions: (0..order.random).map(column).collect(),
-        random: (order.random..order.features).map(column).collect(),
-        features: (order.features..order.colors).map(column).collect(),
-        colors: (order.colors..order.end).map(column).collect(),
+        positions: columns(order.positions),
+        random: columns(order.random),
+        features: columns(order.features),
+        colors: columns(order.colors),
     }
 }
 
@@ -135,10 +141,10 @@ fn neighbourhoods_accept_the_same_candidates() {
             .map(|(plane, (channel, _))| (plane, channel.role == Role::Feature { position: true }))
             .collect();
         at_pixels(&params, &tile, |pass, scratch, x, y| {
-            assert!(pass.gather(scratch, x, y));
+            assert!(dispatch!(SimdLevel::default().level(), simd => pass.gather(simd, scratch, x, y)));
             let window = tile.geometry().window();
             let own = tile.samples_of(window.index(x, y));
-            let mut fast = scratch.rows.samples[own.len()..].iter().copied().peekable();
+            let mut fast = scratch.rows()[own.len()..].iter().copied().peekable();
             for (_, sample) in draws(&tile, &params, pass.execution.seed, pass.t, x, y) {
                 let sample = sample as u32;
                 let (mut accepted, mut margin) = (true, f64::INFINITY);
