@@ -40,7 +40,7 @@ mod share;
 
 pub use coverage::Coverage;
 pub use geometry::{Halo, Rect, TileGeometry};
-pub use lanes::SimdLevel;
+pub use lanes::{SimdLevel, SimdLevelError};
 pub use method::{Method, ParameterError};
 pub use samples::{Channel, ChannelSet, Counts, Plane, Role, SampleTile};
 

@@ -21,8 +21,8 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// This one.
-    pub fn here() -> Self {
+    /// This one, where the filter uses this SIMD level.
+    pub fn here(simd: SimdLevel) -> Self {
         let line = |path: &str, key: &str| {
             let text = fs::read_to_string(path).ok()?;
             let line = text.lines().find_map(|line| line.strip_prefix(key))?;
@@ -34,7 +34,7 @@ impl Machine {
         Self {
             cpu: line("/proc/cpuinfo", "model name").unwrap_or_else(unknown),
             cores: std::thread::available_parallelism().map_or(1, std::num::NonZeroUsize::get),
-            simd: SimdLevel::available().last().map_or_else(unknown, |(name, _)| (*name).to_owned()),
+            simd: simd.name().to_owned(),
             os: format!("{name}{}, {}", kernel.unwrap_or_default(), std::env::consts::ARCH),
             version: format!("rpfd {}", env!("CARGO_PKG_VERSION")),
         }

@@ -204,6 +204,7 @@ mod tests {
             preset: preset.into(),
             parameters: Vec::new(),
             threads: 1,
+            simd: "any".into(),
             seed: 0,
             repeat,
             version: "0".into(),

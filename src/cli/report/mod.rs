@@ -2,9 +2,9 @@
 
 mod data;
 
-use super::{failure::Failure, progress};
+use super::{args::SimdArgs, failure::Failure, progress};
 use crate::{
-    filter::{Execution, Method, Rect, SampleTile, method::PRESETS},
+    filter::{Execution, Method, Rect, SampleTile, SimdLevel, method::PRESETS},
     picture::PictureError,
     report::{
         html::{Page, page},
@@ -66,6 +66,8 @@ pub(crate) struct Args {
     /// Threads to filter on
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "1", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Vec<u32>,
+    #[command(flatten)]
+    simd: SimdArgs,
     /// Measure each so often; times are medians
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeats: u32,
@@ -267,6 +269,7 @@ fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Fa
                         preset: named.method.preset_name().to_owned(),
                         parameters: Key::parameters_of(&named.method),
                         threads: threads as usize,
+                        simd: args.simd.level.name().to_owned(),
                         seed: args.seed,
                         repeat,
                         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -345,7 +348,7 @@ fn measure_all(
             continue;
         }
         let (tile, reference) = loaded.of(job, &sets[job.set], stop)?;
-        let measurement = one(job, methods, tile, reference, (&pools, stop), (&bar, position))?;
+        let measurement = one(job, methods, tile, reference, (&pools, args.simd.level, stop), (&bar, position))?;
         let add = state.add(job.key.clone(), measurement);
         add.map_err(|error| Failure::failed("output_io", format!("the state file: {error}")))?;
     }
@@ -358,7 +361,7 @@ fn one(
     methods: &[Named],
     tile: &SampleTile,
     reference: &[[f32; 3]],
-    (pools, stop): (&BTreeMap<usize, Option<rayon::ThreadPool>>, &AtomicBool),
+    (pools, simd, stop): (&BTreeMap<usize, Option<rayon::ThreadPool>>, SimdLevel, &AtomicBool),
     (bar, position): (&ProgressBar, u64),
 ) -> Result<Measurement, Failure> {
     let report = |share: f32| bar.set_position(position + (share * STEPS as f32) as u64);
@@ -367,6 +370,7 @@ fn one(
         pool: pools.get(&job.key.threads).and_then(Option::as_ref),
         stop: Some(stop),
         progress: Some(&report),
+        simd,
         ..Execution::default()
     };
     let mut measurement = measure(tile, reference, &methods[job.method].method, &execution)?;
@@ -382,7 +386,7 @@ fn write(
     references: &BTreeMap<String, String>,
     outputs: [Option<AtomicFile>; 4],
 ) -> Result<(), Failure> {
-    let (machine, seconds_per_sample) = (Machine::here(), args.seconds_per_sample);
+    let (machine, seconds_per_sample) = (Machine::here(args.simd.level), args.seconds_per_sample);
     let json = || format!("{:#}\n", table::json(rows, seconds_per_sample, &machine));
     let html = || page(&Page { rows, references, machine: &machine, seconds_per_sample });
     // Whole images where there are such.
