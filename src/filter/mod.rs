@@ -36,6 +36,7 @@ pub mod oracle;
 pub mod plan;
 pub mod rpf;
 pub mod samples;
+pub mod scalar;
 mod share;
 
 pub use coverage::Coverage;
