@@ -8,7 +8,7 @@
 use super::finish::finish;
 use super::rpf::{Offsets, Params, draws, params::MAX_BINS, region};
 use super::{Execution, Filtered, Report, Role, SampleTile, Stopped};
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 /// Where the values of a column come from.
 #[derive(Clone, Copy)]
@@ -310,7 +310,7 @@ impl<'a> Scalar<'a> {
         t: usize,
         at: [u32; 2],
         colors: &[[f32; 3]],
-        nodes: &mut HashMap<[u32; 2], Option<Weights>>,
+        nodes: &mut BTreeMap<[u32; 2], Option<Weights>>,
     ) -> Option<Weights> {
         let (spacing, image) = (self.params.information_grid, self.tile.geometry().image());
         let axis = |pixel: u32, size: u32| {
@@ -344,7 +344,7 @@ impl<'a> Scalar<'a> {
     pub fn step(&mut self, t: usize, colors: &[[f32; 3]]) -> Vec<[f32; 3]> {
         let (window, offsets) = (self.tile.geometry().window(), Offsets::new(self.params.boxes[t]));
         let region = region(self.tile.geometry(), self.params, self.tile.varying(), t);
-        let (mut next, mut nodes) = (colors.to_vec(), HashMap::new());
+        let (mut next, mut nodes) = (colors.to_vec(), BTreeMap::new());
         for y in region.y..region.bottom() {
             for x in region.x..region.right() {
                 let interpolated = match self.params.information_grid {

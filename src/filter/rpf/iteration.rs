@@ -110,7 +110,14 @@ impl Pass<'_> {
 
     /// Copies a column's values into place and normalises them; says what they span.
     #[inline(always)]
-    fn load<S: Simd>(&self, simd: S, scratch: &mut Scratch, column: usize, source: Source, missing: bool) -> Span {
+    pub(super) fn load<S: Simd>(
+        &self,
+        simd: S,
+        scratch: &mut Scratch,
+        column: usize,
+        source: Source,
+        missing: bool,
+    ) -> Span {
         let rows = scratch.rows.samples.len();
         let stride = scratch.stride;
         let values = &mut scratch.columns[column * stride..][..padded(rows)];
@@ -169,7 +176,14 @@ impl Pass<'_> {
 
     /// A colour channel's normalised column, from the scaled radiance.
     #[inline(always)]
-    fn load_color<S: Simd>(&self, simd: S, scratch: &mut Scratch, column: usize, channel: usize, span: &Span) {
+    pub(super) fn load_color<S: Simd>(
+        &self,
+        simd: S,
+        scratch: &mut Scratch,
+        column: usize,
+        channel: usize,
+        span: &Span,
+    ) {
         let rows = scratch.rows.samples.len();
         let stride = scratch.stride;
         let values = &mut scratch.columns[column * stride..][..padded(rows)];

@@ -19,6 +19,9 @@ pub mod params;
 mod random;
 mod relevance;
 mod spikes;
+#[cfg(feature = "bench")]
+#[doc(hidden)]
+pub mod stages;
 mod statistics;
 mod weights;
 
