@@ -2,11 +2,11 @@
 
 use crate::filter::SimdLevel;
 use rustix::time::{ClockId, clock_gettime};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::fs;
 
 /// The machine and the program.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Machine {
     /// What the processor calls itself.
     pub cpu: String,
@@ -54,7 +54,16 @@ pub fn reset_peak() -> bool {
 
 /// Greatest resident size of this process in bytes, since the last [`reset_peak`].
 pub fn peak_resident() -> Option<u64> {
+    status("VmHWM:")
+}
+
+/// Resident size of this process in bytes.
+pub fn resident() -> Option<u64> {
+    status("VmRSS:")
+}
+
+fn status(key: &str) -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let line = status.lines().find_map(|line| line.strip_prefix(key))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib << 10)
 }

@@ -1,6 +1,7 @@
 //! What the measurements say together: a row for each data set, sample count, method and number of threads.
 
 use super::{measure::Measurement, plan::Key, scores::Scores};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// The preset that the others are compared with.
@@ -17,7 +18,7 @@ pub struct Own {
 }
 
 /// The median of what was measured several times, and how far it went.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Spread {
     /// Of an even number the mean of the two in the middle.
     pub median: f64,

@@ -128,6 +128,7 @@ fn same_bits_at_every_simd_level() {
         &["filter", &tiles, "-o", &out][..],
         &["serve", "--listen", "127.0.0.1:0", "--data-dir", &folder],
         &["report", "--synth", "all@8x8"],
+        &["cost"],
         &["stability"],
         &["demo", "--out", &folder],
     ] {
