@@ -6,7 +6,8 @@
 //! ```
 //!
 //! A stage is timed where it stands: those before it have just run on the same pixel, as in the filter, and pixels follow
-//! one another as there. Times are medians; ratios are of times on one thread.
+//! one another as there. Times are medians on one thread: by the clock of the stages, which take microseconds, and of the
+//! processor for the whole.
 #![expect(clippy::unwrap_used, reason = "a failed unwrap ends the benchmark")]
 
 use criterion::{BenchmarkId, Criterion};
@@ -15,7 +16,7 @@ use rpfd::filter::rpf::stages::{STAGES, Stage, with_stages};
 use rpfd::filter::rpf::{Offsets, Params};
 use rpfd::filter::scalar::{self, Scalar};
 use rpfd::filter::{Execution, Method, Rect, SampleTile, SimdLevel, TileGeometry, filter};
-use rpfd::report::plan::subset;
+use rpfd::report::{machine::cpu_seconds, plan::subset};
 use rpfd::store::Spool;
 use rpfd::synth::Scene;
 use rpfd::wire::file::TileFile;
@@ -89,7 +90,7 @@ impl Times {
     }
 
     fn print(&self) {
-        println!("\n{:<44}{:<9}{:>12}{:>12}{:>9}", "", "SIMD", "fast", "scalar", "ratio");
+        println!("\n{:<46}{:<9}{:>12}{:>12}{:>9}", "", "SIMD", "fast", "scalar", "ratio");
         let mut seen = Vec::new();
         for (name, path, _) in self.0.borrow().iter() {
             if path == "scalar" || seen.contains(&(name, path)) {
@@ -102,7 +103,7 @@ impl Times {
                 1e-4.. => format!("{:.2} ms", 1e3 * seconds),
                 _ => format!("{:.2} us", 1e6 * seconds),
             };
-            println!("{name:<44}{path:<9}{:>12}{:>12}{:>8.2}x", text(fast), text(scalar), scalar / fast);
+            println!("{name:<46}{path:<9}{:>12}{:>12}{:>8.2}x", text(fast), text(scalar), scalar / fast);
         }
     }
 }
@@ -111,6 +112,12 @@ fn timed<T>(work: impl FnOnce() -> T) -> Duration {
     let started = Instant::now();
     black_box(work());
     started.elapsed()
+}
+
+fn cpu_timed<T>(work: impl FnOnce() -> T) -> Duration {
+    let before = cpu_seconds();
+    black_box(work());
+    Duration::from_secs_f64(cpu_seconds() - before)
 }
 
 /// Pixels of a band of rows column by column, as the filter takes them, again and again.
@@ -174,9 +181,9 @@ fn whole(criterion: &mut Criterion, times: &Times) {
             let name = format!("{preset} of {scene}, {side} x {side}");
             for (level, simd) in SimdLevel::available() {
                 let execution = Execution { simd, ..Execution::default() };
-                times.bench(criterion, "whole", &name, level, || timed(|| filter(&tile, &method, &execution)));
+                times.bench(criterion, "whole", &name, level, || cpu_timed(|| filter(&tile, &method, &execution)));
             }
-            times.bench(criterion, "whole", &name, "scalar", || timed(|| scalar::filter(&tile, &params, 0)));
+            times.bench(criterion, "whole", &name, "scalar", || cpu_timed(|| scalar::filter(&tile, &params, 0)));
         }
     }
 }

@@ -139,7 +139,7 @@ pub fn json(costs: &Costs) -> Value {
     })
 }
 
-/// Reads what [`json`] has made.
+/// Reads what [`json()`] has made.
 pub fn from_json(text: &str) -> Result<Costs, serde_json::Error> {
     serde_json::from_str(text)
 }
