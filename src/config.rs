@@ -2,6 +2,7 @@
 //!
 //! Zero never means unlimited: it is refused.
 
+use crate::filter::SimdLevel;
 use std::{
     fmt,
     net::{Ipv4Addr, SocketAddr},
@@ -87,6 +88,8 @@ pub struct Config {
     pub memory: ByteSize,
     /// Threads that filter: 1 to [`MAX_THREADS`].
     pub threads: usize,
+    /// SIMD instructions that they filter with.
+    pub simd: SimdLevel,
     /// Folder for canvases and for results that nobody has read yet; made if it is not there.
     pub data_dir: PathBuf,
     /// How long a tile may wait for memory before it is refused.
@@ -112,6 +115,7 @@ impl Default for Config {
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)),
             memory: ByteSize(1 << 30),
             threads: std::thread::available_parallelism().map_or(1, |n| n.get().min(MAX_THREADS)),
+            simd: SimdLevel::default(),
             data_dir,
             queue_deadline: Duration::from_secs(60),
             header_deadline: Duration::from_secs(15),

@@ -3,7 +3,7 @@
 use super::failure::Failure;
 use crate::{
     filter::{
-        Method, ParameterError,
+        Method, ParameterError, SimdLevel,
         method::{Algorithm, PRESETS},
     },
     stitch::{
@@ -151,6 +151,15 @@ impl ThreadArgs {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(count).thread_name(|i| format!("compute-{i}")).build();
         pool.map(Some).map_err(|error| Failure::failed("threads", format!("cannot start {count} threads: {error}")))
     }
+}
+
+/// With which SIMD instructions.
+#[derive(clap::Args)]
+pub(crate) struct SimdArgs {
+    /// SIMD instructions to compute with, for the same bits in more time: auto for the best that this CPU has, or one
+    /// of its levels, sse2, sse4.2, avx2 or avx512
+    #[arg(long = "simd", env = "RPFD_SIMD", value_name = "LEVEL", default_value = "auto")]
+    pub(crate) level: SimdLevel,
 }
 
 /// Reads a size like `640x480`.

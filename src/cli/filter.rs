@@ -1,7 +1,7 @@
 //! `rpfd filter`: a file of tiles in, an EXR out, without a service.
 
 use super::{
-    args::{ExrArgs, MethodArgs, ThreadArgs},
+    args::{ExrArgs, MethodArgs, SimdArgs, ThreadArgs},
     failure::Failure,
     input::Input,
     progress,
@@ -9,7 +9,7 @@ use super::{
 };
 use crate::{
     config::ByteSize,
-    filter::{Execution, Filtered, Halo, Method, SampleTile, Stopped, filter},
+    filter::{Execution, Filtered, Halo, Method, SampleTile, SimdLevel, Stopped, filter},
     picture::write_png,
     stitch::{ExrOptions, Offer, Pixels, Stitcher, atomic::AtomicFile},
     store::spool::Spool,
@@ -54,6 +54,8 @@ pub(crate) struct Args {
     temp_dir: Option<PathBuf>,
     #[command(flatten)]
     threads: ThreadArgs,
+    #[command(flatten)]
+    simd: SimdArgs,
     /// Whether what can have no effect is left out, like planes that are constant: off takes longer, for the same file
     #[arg(long, value_name = "on|off", default_value = "on", value_parser = ["on", "off"])]
     leave_out: String,
@@ -88,6 +90,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         method,
         seed: args.method.seed,
         leave_out: args.leave_out == "on",
+        simd: args.simd.level,
         threads: args.threads.count(),
         pool: args.threads.pool()?,
         stop: progress::interrupted(),
@@ -147,6 +150,7 @@ pub(crate) struct Offline<'a> {
     pub(crate) seed: u64,
     /// Whether what can have no effect is left out.
     pub(crate) leave_out: bool,
+    pub(crate) simd: SimdLevel,
     pub(crate) threads: usize,
     pub(crate) pool: Option<rayon::ThreadPool>,
     pub(crate) stop: Arc<AtomicBool>,
@@ -221,7 +225,7 @@ impl Offline<'_> {
             stop: Some(&self.stop),
             progress: Some(&advance),
             leave_out: self.leave_out,
-            ..Execution::default()
+            simd: self.simd,
         };
         let filtered = filter(tile, &self.method, &execution)?;
         bar.set_position(before + core.area());
@@ -273,6 +277,7 @@ impl Run {
             "image": input.image(),
             "seconds": seconds,
             "threads": offline.threads,
+            "simd": offline.simd.name(),
             "preset": offline.method.preset_name(),
             "seed": offline.seed,
             "parameters": offline.method.parameters().into_iter().collect::<BTreeMap<_, _>>(),

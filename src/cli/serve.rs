@@ -4,7 +4,7 @@ use std::{net::SocketAddr, path::PathBuf};
 
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::{Failure, FailureKind};
+use super::{Failure, FailureKind, args::SimdArgs};
 use crate::{
     config::{ByteSize, Config},
     service::{ServeError, Service},
@@ -30,6 +30,8 @@ pub(crate) struct Args {
     /// Threads that filter [default: one per CPU]
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
+    #[command(flatten)]
+    simd: SimdArgs,
     /// Folder for canvases and unread results; made if missing [default: $TMPDIR or /var/tmp]
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
@@ -56,6 +58,7 @@ impl Args {
             listen: self.listen.unwrap_or(default.listen),
             memory: self.memory.unwrap_or(default.memory),
             threads: self.threads.unwrap_or(default.threads),
+            simd: self.simd.level,
             data_dir: self.data_dir.unwrap_or(default.data_dir),
             queue_deadline: seconds(self.queue_deadline, default.queue_deadline)?,
             idle_deadline: seconds(self.idle_deadline, default.idle_deadline)?,

@@ -1,6 +1,6 @@
 //! `rpfd stability`.
 
-use super::{failure::Failure, progress};
+use super::{args::SimdArgs, failure::Failure, progress};
 use crate::{
     filter::{Stopped, method::PRESETS},
     report::stability::{Case, Deviation, Lab, Outcome, Verdict, cases},
@@ -23,6 +23,8 @@ pub(crate) struct Args {
     /// Run this preset only; may be given several times
     #[arg(long = "preset", value_name = "NAME", value_parser = names())]
     presets: Vec<String>,
+    #[command(flatten)]
+    simd: SimdArgs,
     /// Print everything as JSON
     #[arg(long)]
     pub(crate) json: bool,
@@ -66,7 +68,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         presets.into_iter().filter(|p| args.presets.is_empty() || args.presets.iter().any(|a| a == p)).collect();
     let stop = progress::interrupted();
     let bar = progress::bar("cases", (cases.len() * presets.len()) as u64);
-    let (mut lab, mut results) = (Lab::default(), Vec::new());
+    let (mut lab, mut results) = (Lab::new(args.simd.level), Vec::new());
     for case in &cases {
         for &preset in &presets {
             if stop.load(Ordering::Relaxed) {

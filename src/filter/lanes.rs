@@ -46,10 +46,46 @@ impl Default for SimdLevel {
     }
 }
 
+/// A level that is not among those of this CPU.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("this CPU has no SIMD level {0:?}: write auto for the best, or one that it has: {has}", has = SimdLevel::names().join(", "))]
+pub struct SimdLevelError(String);
+
+impl std::str::FromStr for SimdLevel {
+    type Err = SimdLevelError;
+
+    /// Reads `auto` or the name of a level that this CPU has.
+    fn from_str(text: &str) -> Result<Self, SimdLevelError> {
+        let named = || Self::available().into_iter().find(|(name, _)| *name == text).map(|(_, level)| level);
+        let level = if text == "auto" { Some(Self::default()) } else { named() };
+        level.ok_or_else(|| SimdLevelError(text.to_owned()))
+    }
+}
+
+impl PartialEq for SimdLevel {
+    fn eq(&self, other: &Self) -> bool {
+        self.name() == other.name()
+    }
+}
+
 impl SimdLevel {
     /// The levels that this CPU has, lowest first, with their names.
     pub fn available() -> Vec<(&'static str, Self)> {
-        let best = Level::new();
+        Self::up_to(Level::new())
+    }
+
+    /// The names of the levels that this CPU has, lowest first.
+    pub fn names() -> Vec<&'static str> {
+        Self::available().into_iter().map(|(name, _)| name).collect()
+    }
+
+    /// Its name, as [`SimdLevel::available`] has it.
+    pub fn name(self) -> &'static str {
+        Self::up_to(self.0).last().map_or("none", |(name, _)| name)
+    }
+
+    /// A level and those below it, lowest first, with their names.
+    fn up_to(best: Level) -> Vec<(&'static str, Self)> {
         let mut levels = Vec::new();
         #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
         {
@@ -157,6 +193,17 @@ mod tests {
             assert!(worst < 2.5e-7, "{name}: relative error {worst:e}");
             assert_eq!(*reference.get_or_insert_with(|| bits.clone()), bits, "{name}");
         }
+    }
+
+    #[test]
+    fn levels_have_names() {
+        for (name, level) in SimdLevel::available() {
+            assert_eq!((name.parse(), level.name()), (Ok(level), name));
+        }
+        assert_eq!("auto".parse(), Ok(SimdLevel::default()));
+        assert_eq!(SimdLevel::names().last(), Some(&SimdLevel::default().name()));
+        let error = "mmx".parse::<SimdLevel>().unwrap_err().to_string();
+        assert!(error.contains("\"mmx\"") && error.ends_with(&SimdLevel::names().join(", ")), "{error}");
     }
 
     #[test]

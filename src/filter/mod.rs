@@ -36,11 +36,12 @@ pub mod oracle;
 pub mod plan;
 pub mod rpf;
 pub mod samples;
+pub mod scalar;
 mod share;
 
 pub use coverage::Coverage;
 pub use geometry::{Halo, Rect, TileGeometry};
-pub use lanes::SimdLevel;
+pub use lanes::{SimdLevel, SimdLevelError};
 pub use method::{Method, ParameterError};
 pub use samples::{Channel, ChannelSet, Counts, Plane, Role, SampleTile};
 

@@ -1,6 +1,7 @@
 //! The report as one page that needs nothing else: no scripts, no fonts, no files beside it.
 
 use super::{
+    cost::{self, Costs},
     machine::Machine,
     plots,
     rows::{BASE, Row},
@@ -21,6 +22,8 @@ pub struct Page<'a> {
     pub machine: &'a Machine,
     /// Seconds per megapixel that rendering one sample per pixel takes, if that was said.
     pub seconds_per_sample: Option<f64>,
+    /// What filtering costs, if that was measured.
+    pub cost: Option<&'a Costs>,
 }
 
 const STYLE: &str = "\
@@ -60,6 +63,9 @@ pub fn page(page: &Page) -> String {
         out += "<h2>Error against samples</h2>\n<p class=\"note\">The slope of the line through the logarithms: -1 is what \
                 independent samples give.</p>\n";
         samples.iter().for_each(|panel| out += &draw(std::slice::from_ref(panel), 2));
+    }
+    if let Some(costs) = page.cost {
+        cost::show::section(&mut out, costs);
     }
     out += "<h2>Numbers</h2>\n";
     numbers(&mut out, page);

@@ -26,6 +26,9 @@ pub struct Key {
     pub parameters: Vec<String>,
     /// Threads that filtered.
     pub threads: usize,
+    /// SIMD level that they used.
+    #[serde(default)]
+    pub simd: String,
     /// Keys the method's random draws.
     pub seed: u64,
     /// 0 for the first time the same is measured.

@@ -1,6 +1,7 @@
 //! What the measurements say together: a row for each data set, sample count, method and number of threads.
 
 use super::{measure::Measurement, plan::Key, scores::Scores};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// The preset that the others are compared with.
@@ -17,7 +18,7 @@ pub struct Own {
 }
 
 /// The median of what was measured several times, and how far it went.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Spread {
     /// Of an even number the mean of the two in the middle.
     pub median: f64,
@@ -204,6 +205,7 @@ mod tests {
             preset: preset.into(),
             parameters: Vec::new(),
             threads: 1,
+            simd: "any".into(),
             seed: 0,
             repeat,
             version: "0".into(),

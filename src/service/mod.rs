@@ -135,7 +135,7 @@ impl Service {
         let (stop, stopping) = watch::channel(false);
         let mut connections = JoinSet::new();
         let mut shutdown = pin!(shutdown);
-        tracing::info!(%address, memory = %inner.config.memory, threads = inner.config.threads, "listening");
+        tracing::info!(%address, memory = %inner.config.memory, threads = inner.config.threads, simd = inner.config.simd.name(), "listening");
         loop {
             let room = connections.len() < inner.config.connections;
             tokio::select! {

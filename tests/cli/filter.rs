@@ -101,6 +101,44 @@ fn less_halo_than_the_preset_reads_is_made_up_for() {
     assert!(bytes(a) == bytes(b));
 }
 
+/// All SIMD levels, asked for by the flag or by the environment, give one file; a level that there is not is refused.
+#[test]
+fn same_bits_at_every_simd_level() {
+    let folder = Folder::new();
+    let (tiles, out) =
+        (folder.synth("in.tiles", &["--size", "40x30", "--spp", "3", "--tile", "64"]), folder.path("out"));
+    let levels = rpfd::filter::SimdLevel::names();
+    let best = *levels.last().unwrap();
+    for preset in ["lean", "paper-fast", "cross-bilateral"] {
+        let filter = ["filter", &tiles, "-o", &out, "--preset", preset];
+        assert_eq!(json(filter)["simd"], best);
+        let expected = bytes(&out);
+        for level in &levels {
+            assert_eq!(json(filter.iter().chain(&["--simd", level]))["simd"], *level);
+            assert!(bytes(&out) == expected, "{preset} at {level}");
+            let mut command = Command::new(env!("CARGO_BIN_EXE_rpfd"));
+            let output = command.args(filter).arg("--json").env("RPFD_SIMD", level).output().unwrap();
+            let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+            assert_eq!(report["simd"], *level);
+            assert!(bytes(&out) == expected, "{preset} at {level}");
+        }
+    }
+    let folder = folder.path("served");
+    for command in [
+        &["filter", &tiles, "-o", &out][..],
+        &["serve", "--listen", "127.0.0.1:0", "--data-dir", &folder],
+        &["report", "--synth", "all@8x8"],
+        &["cost"],
+        &["stability"],
+        &["demo", "--out", &folder],
+    ] {
+        let output = rpfd(command.iter().chain(&["--simd", "avx1024"]));
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains("\"avx1024\"") && said.contains(&levels.join(", ")) && said.contains("auto"), "{said}");
+    }
+}
+
 #[test]
 fn missing_tiles_are_refused_unless_partial() {
     let folder = Folder::new();

@@ -2,11 +2,12 @@
 
 mod data;
 
-use super::{failure::Failure, progress};
+use super::{args::SimdArgs, failure::Failure, progress};
 use crate::{
-    filter::{Execution, Method, Rect, SampleTile, method::PRESETS},
+    filter::{Execution, Method, Rect, SampleTile, SimdLevel, method::PRESETS},
     picture::PictureError,
     report::{
+        cost::{self, Costs},
         html::{Page, page},
         machine::Machine,
         measure::{MeasureError, Measurement, measure, middle},
@@ -66,6 +67,8 @@ pub(crate) struct Args {
     /// Threads to filter on
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "1", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Vec<u32>,
+    #[command(flatten)]
+    simd: SimdArgs,
     /// Measure each so often; times are medians
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeats: u32,
@@ -77,6 +80,9 @@ pub(crate) struct Args {
     /// together, and of the plain samples of equal error
     #[arg(long, value_name = "S", value_parser = seconds)]
     seconds_per_sample: Option<f64>,
+    /// What `rpfd cost --json FILE` has measured: adds its plots to the page
+    #[arg(long, value_name = "FILE", requires = "html")]
+    cost: Option<PathBuf>,
     /// Keys every random draw of the methods and of --synth
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -118,13 +124,13 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 /// A method and what it is called.
-struct Named {
-    label: String,
-    method: Method,
+pub(super) struct Named {
+    pub(super) label: String,
+    pub(super) method: Method,
 }
 
 /// Reads `NAME:k=v,k=v`; what has no `=` goes on with the value before it.
-fn named(text: &str) -> Result<Named, Failure> {
+pub(super) fn named(text: &str) -> Result<Named, Failure> {
     let (preset, settings) = text.split_once(':').unwrap_or((text, ""));
     let mut pairs: Vec<(&str, String)> = Vec::new();
     for part in settings.split(',').filter(|part| !part.is_empty()) {
@@ -190,6 +196,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::usage("no_data", "nothing to measure: give --data, --folder or --synth"));
     }
     let methods = args.methods()?;
+    let cost = args.cost.as_deref().map(read_cost).transpose()?;
     let outputs = args.outputs()?;
     let mut state = match &args.state {
         Some(path) => State::open(path).map_err(|error| state_failure(path, &error))?,
@@ -224,7 +231,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             references.insert(job.key.data.clone(), picture);
         }
     }
-    write(args, &rows, &references, outputs)
+    write(args, &rows, &references, cost.as_ref(), outputs)
+}
+
+/// What `rpfd cost` has written.
+fn read_cost(path: &Path) -> Result<Costs, Failure> {
+    let fail = |code, error: &dyn std::fmt::Display| Failure::input(code, format!("{}: {error}", path.display()));
+    let text = std::fs::read_to_string(path).map_err(|error| fail("io", &error))?;
+    cost::show::from_json(&text)
+        .map_err(|error| fail("bad_json", &format!("not what rpfd cost --json writes: {error}")))
 }
 
 fn state_failure(path: &Path, error: &std::io::Error) -> Failure {
@@ -267,6 +282,7 @@ fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Fa
                         preset: named.method.preset_name().to_owned(),
                         parameters: Key::parameters_of(&named.method),
                         threads: threads as usize,
+                        simd: args.simd.level.name().to_owned(),
                         seed: args.seed,
                         repeat,
                         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -345,7 +361,7 @@ fn measure_all(
             continue;
         }
         let (tile, reference) = loaded.of(job, &sets[job.set], stop)?;
-        let measurement = one(job, methods, tile, reference, (&pools, stop), (&bar, position))?;
+        let measurement = one(job, methods, tile, reference, (&pools, args.simd.level, stop), (&bar, position))?;
         let add = state.add(job.key.clone(), measurement);
         add.map_err(|error| Failure::failed("output_io", format!("the state file: {error}")))?;
     }
@@ -358,7 +374,7 @@ fn one(
     methods: &[Named],
     tile: &SampleTile,
     reference: &[[f32; 3]],
-    (pools, stop): (&BTreeMap<usize, Option<rayon::ThreadPool>>, &AtomicBool),
+    (pools, simd, stop): (&BTreeMap<usize, Option<rayon::ThreadPool>>, SimdLevel, &AtomicBool),
     (bar, position): (&ProgressBar, u64),
 ) -> Result<Measurement, Failure> {
     let report = |share: f32| bar.set_position(position + (share * STEPS as f32) as u64);
@@ -367,6 +383,7 @@ fn one(
         pool: pools.get(&job.key.threads).and_then(Option::as_ref),
         stop: Some(stop),
         progress: Some(&report),
+        simd,
         ..Execution::default()
     };
     let mut measurement = measure(tile, reference, &methods[job.method].method, &execution)?;
@@ -380,11 +397,12 @@ fn write(
     args: &Args,
     rows: &[Row],
     references: &BTreeMap<String, String>,
+    cost: Option<&Costs>,
     outputs: [Option<AtomicFile>; 4],
 ) -> Result<(), Failure> {
-    let (machine, seconds_per_sample) = (Machine::here(), args.seconds_per_sample);
+    let (machine, seconds_per_sample) = (Machine::here(args.simd.level), args.seconds_per_sample);
     let json = || format!("{:#}\n", table::json(rows, seconds_per_sample, &machine));
-    let html = || page(&Page { rows, references, machine: &machine, seconds_per_sample });
+    let html = || page(&Page { rows, references, machine: &machine, seconds_per_sample, cost });
     // Whole images where there are such.
     let plotted: Vec<Row> =
         rows.iter().filter(|row| !row.key.part || rows.iter().all(|row| row.key.part)).cloned().collect();

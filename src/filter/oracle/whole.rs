@@ -2,7 +2,7 @@
 //!
 //! Every plane is computed with, constant or not: that leaving planes out changes nothing is the fast path's claim.
 
-use super::super::rpf::{Params, draws, region};
+use super::super::rpf::{Offsets, Params, draws, region};
 use super::super::{Rect, Role, SampleTile};
 use super::{Cluster, Columns, Weights, bin, deviation, filter, mean, normalise, pixel, tame_spikes, weigh};
 use std::collections::HashMap;
@@ -22,6 +22,8 @@ pub struct Whole<'a> {
     tile: &'a SampleTile,
     params: &'a Params,
     seed: u64,
+    /// Of each iteration.
+    offsets: Vec<Offsets>,
     film: Vec<usize>,
     random: Vec<usize>,
     /// Planes, and how many deviations a candidate may be off.
@@ -59,7 +61,8 @@ impl<'a> Whole<'a> {
         let features = features.collect();
         let film = planes(|role| matches!(role, Role::Film));
         let random = planes(|role| matches!(role, Role::Random { .. }));
-        Self { tile, params, seed, film, random, features }
+        let offsets = params.boxes.iter().map(|&width| Offsets::new(width)).collect();
+        Self { tile, params, seed, offsets, film, random, features }
     }
 
     /// The colours before the first iteration.
@@ -101,7 +104,7 @@ impl<'a> Whole<'a> {
         });
         let clusters: Vec<_> = clusters.collect();
         let mut found = Neighbourhood { pixels: vec![pixel; own.len()], rows: own, near: 0 };
-        for (pixel, sample) in draws(self.tile, self.params, self.seed, t, x, y) {
+        for (pixel, sample) in draws(&self.offsets[t], self.tile, self.params, self.seed, t, x, y) {
             let mut accepted = true;
             for (plane, cluster) in &clusters {
                 let (inside, margin) = cluster.accepts(f64::from(self.tile.value(*plane, sample)));

@@ -53,6 +53,8 @@ pub(crate) struct Scratch {
     columns: Vec<f32>,
     radiance: Vec<f32>,
     stride: usize,
+    /// Whether each column is constant.
+    constant: Vec<bool>,
     histograms: Histograms,
     pub(super) dependencies: Dependencies,
     pub(crate) weights: Weights,
@@ -76,6 +78,7 @@ impl Scratch {
             columns: vec![0.0; columns * stride],
             radiance: vec![0.0; 3 * stride],
             stride,
+            constant: vec![true; columns],
             histograms: Histograms::with_capacity(columns, stride, params.bins, leave_out),
             dependencies: Dependencies::new(features.len()),
             weights: Weights::new(features.len()),
@@ -90,7 +93,8 @@ impl Scratch {
     pub(crate) fn bytes(order: &ColumnOrder, room: &Room, varying: bool, bins: u32) -> u64 {
         let (stride, columns, features) = (padded(room.rows), order.columns(), order.features.len());
         let values = stride * size_of::<u32>() + (columns + 3) * stride * size_of::<f32>();
-        let small = features * (3 * size_of::<f64>() + size_of::<f32>())
+        let small = columns
+            + features * (3 * size_of::<f64>() + size_of::<f32>())
             + (features + 3) * (size_of::<usize>() + size_of::<f32>());
         (values + small) as u64
             + Histograms::bytes(columns, stride, bins)
@@ -140,12 +144,6 @@ impl Scratch {
         }
         let (count, first) = (self.count, self.order.colors.start);
         normalise(simd, &mut self.columns([first, first + 1, first + 2]), count, spans, factors);
-    }
-
-    #[inline(always)]
-    fn set_histogram<S: Simd>(&mut self, simd: S, column: usize, constant: bool, terms: &[f64]) {
-        let values = &self.columns[column * self.stride..][..padded(self.count)];
-        self.histograms.set(simd, column, values, constant, terms);
     }
 }
 
@@ -201,63 +199,92 @@ impl Pass<'_> {
 
     /// Steps 2 to 4 of a gathered neighbourhood: loads every column, and sets `scratch.weights`.
     #[inline(always)]
-    pub(super) fn weigh_gathered<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
+    fn weigh_gathered<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
+        simd.vectorize(
+            #[inline(always)]
+            || self.load_columns(simd, scratch),
+        );
+        simd.vectorize(
+            #[inline(always)]
+            || self.normalise_columns(simd, scratch, spans),
+        );
+        simd.vectorize(
+            #[inline(always)]
+            || self.count_bins(simd, scratch),
+        );
+        simd.vectorize(
+            #[inline(always)]
+            || self.measure_dependencies(simd, scratch),
+        );
+    }
+
+    /// Copies every column but the colours' into place.
+    #[inline(always)]
+    pub(super) fn load_columns<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
+        let Scratch { block, columns, rows, count, stride, order, .. } = scratch;
+        let (rows, others) = (&rows[..padded(*count)], order.positions.start * *stride);
+        block.gather_features(simd, rows, columns, *stride);
+        block.gather_others(simd, rows, &mut columns[others..], *stride);
+    }
+
+    /// Step 2: normalises every column, and notes which are constant.
+    #[inline(always)]
+    pub(super) fn normalise_columns<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
         let ColumnOrder { features, positions, random, colors } = scratch.order.clone();
-        scratch.histograms.start(scratch.count);
-        simd.vectorize(
-            #[inline(always)]
-            || {
-                let Scratch { block, columns, rows, count, stride, .. } = &mut *scratch;
-                let (rows, others) = (&rows[..padded(*count)], positions.start * *stride);
-                block.gather_features(simd, rows, columns, *stride);
-                block.gather_others(simd, rows, &mut columns[others..], *stride);
-            },
-        );
-        simd.vectorize(
-            #[inline(always)]
-            || {
-                for part in [features.clone(), positions.start..random.end] {
-                    let whole = part.end - part.len() % BATCH;
-                    for first in (part.start..whole).step_by(BATCH) {
-                        let batch = [first, first + 1, first + 2, first + 3];
-                        let spans = scratch.normalise(simd, batch, &[1.0; BATCH]);
-                        for (column, span) in batch.into_iter().zip(spans) {
-                            scratch.set_histogram(simd, column, span.constant(), self.terms);
-                        }
-                    }
-                    for column in whole..part.end {
-                        let [span] = scratch.normalise(simd, [column], &[1.0]);
-                        scratch.set_histogram(simd, column, span.constant(), self.terms);
-                    }
+        for part in [features, positions.start..random.end] {
+            let whole = part.end - part.len() % BATCH;
+            for first in (part.start..whole).step_by(BATCH) {
+                let batch = [first, first + 1, first + 2, first + 3];
+                let spans = scratch.normalise(simd, batch, &[1.0; BATCH]);
+                for (column, span) in batch.into_iter().zip(spans) {
+                    scratch.constant[column] = span.constant();
                 }
-                scratch.normalise_colors(simd, spans, &[1.0; 3]);
-                for (column, span) in colors.clone().zip(spans) {
-                    scratch.set_histogram(simd, column, span.constant(), self.terms);
-                }
-            },
-        );
-        simd.vectorize(
-            #[inline(always)]
-            || {
-                let Scratch { histograms, dependencies, .. } = scratch;
-                for (channel, column) in colors.enumerate() {
-                    dependencies.color_position[channel] =
-                        histograms.information(simd, column, &positions, self.terms).iter().sum();
-                    dependencies.color_random[channel] =
-                        histograms.information(simd, column, &random, self.terms).iter().sum();
-                    let on_features = histograms.information(simd, column, &features, self.terms);
-                    for (sum, information) in dependencies.color_feature.iter_mut().zip(on_features) {
-                        *sum = information + if channel == 0 { 0.0 } else { *sum };
-                    }
-                }
-                for (feature, column) in features.enumerate() {
-                    dependencies.feature_position[feature] =
-                        histograms.information(simd, column, &positions, self.terms).iter().sum();
-                    dependencies.feature_random[feature] =
-                        histograms.information(simd, column, &random, self.terms).iter().sum();
-                }
-            },
-        );
+            }
+            for column in whole..part.end {
+                let [span] = scratch.normalise(simd, [column], &[1.0]);
+                scratch.constant[column] = span.constant();
+            }
+        }
+        scratch.normalise_colors(simd, spans, &[1.0; 3]);
+        for (column, span) in colors.zip(spans) {
+            scratch.constant[column] = span.constant();
+        }
+    }
+
+    /// The histograms of all normalised columns.
+    #[inline(always)]
+    pub(super) fn count_bins<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
+        let Scratch { histograms, columns, constant, order, count, stride, .. } = scratch;
+        let ColumnOrder { features, positions, random, colors } = order.clone();
+        histograms.start(*count);
+        for part in [features, positions.start..random.end, colors] {
+            for column in part {
+                let values = &columns[column * *stride..][..padded(*count)];
+                histograms.set(simd, column, values, constant[column], self.terms);
+            }
+        }
+    }
+
+    /// Steps 3 and 4, from the histograms.
+    #[inline(always)]
+    pub(super) fn measure_dependencies<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
+        let Scratch { histograms, dependencies, order, .. } = &mut *scratch;
+        let ColumnOrder { features, positions, random, colors } = order.clone();
+        for (channel, column) in colors.enumerate() {
+            dependencies.color_position[channel] =
+                histograms.information(simd, column, &positions, self.terms).iter().sum();
+            dependencies.color_random[channel] = histograms.information(simd, column, &random, self.terms).iter().sum();
+            let on_features = histograms.information(simd, column, &features, self.terms);
+            for (sum, information) in dependencies.color_feature.iter_mut().zip(on_features) {
+                *sum = information + if channel == 0 { 0.0 } else { *sum };
+            }
+        }
+        for (feature, column) in features.enumerate() {
+            dependencies.feature_position[feature] =
+                histograms.information(simd, column, &positions, self.terms).iter().sum();
+            dependencies.feature_random[feature] =
+                histograms.information(simd, column, &random, self.terms).iter().sum();
+        }
         scratch.weights.set(&scratch.dependencies, self.t);
     }
 
@@ -292,23 +319,30 @@ impl Pass<'_> {
             #[inline(always)]
             || self.scale_columns(simd, scratch, &spans, interpolated, out.len() / 3),
         );
-        let distances = Distances {
-            columns: &scratch.columns,
-            stride: scratch.stride,
-            active: &scratch.active,
-            radiance: &scratch.radiance,
-            spans: &spans,
-            rows: scratch.count,
-        };
         simd.vectorize(
             #[inline(always)]
-            || bilateral::filter(simd, &distances, out),
+            || self.filter_samples(simd, scratch, &spans, out),
         );
+    }
+
+    /// Step 5, with scaled columns.
+    #[inline(always)]
+    pub(super) fn filter_samples<S: Simd>(&self, simd: S, scratch: &Scratch, spans: &[Span; 3], out: &mut [f32]) {
+        let Scratch { columns, stride, active, radiance, count, .. } = scratch;
+        let distances = Distances { columns, stride: *stride, active, radiance, spans, rows: *count };
+        bilateral::filter(simd, &distances, out);
     }
 
     /// Scales the columns that weigh anything by their factors, and lists them; they are normalised first, if `fresh`.
     #[inline(always)]
-    fn scale_columns<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3], fresh: bool, own: usize) {
+    pub(super) fn scale_columns<S: Simd>(
+        &self,
+        simd: S,
+        scratch: &mut Scratch,
+        spans: &[Span; 3],
+        fresh: bool,
+        own: usize,
+    ) {
         let steepness = steepness(scratch.weights.confidence, self.params.sigma8_squared, own);
         let factor = |weight: f32| (0.5 * steepness * f64::from(weight)).sqrt() as f32;
         // A difference that weighs nothing adds 0.
@@ -318,7 +352,8 @@ impl Pass<'_> {
             block.gather_features(simd, &rows[..padded(*count)], columns, *stride);
         }
         let Scratch { active, factors, weights, order, .. } = &mut *scratch;
-        (active.clear(), factors.clear());
+        active.clear();
+        factors.clear();
         let columns = order.features.clone().chain(order.colors.clone());
         for (column, &weight) in columns.zip(weights.features.iter().chain(&weights.color)) {
             let factor = factor(weight);

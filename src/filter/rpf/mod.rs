@@ -22,12 +22,16 @@ pub mod params;
 mod random;
 mod relevance;
 mod spikes;
+#[cfg(feature = "bench")]
+#[doc(hidden)]
+pub mod stages;
 mod statistics;
 mod weights;
 
 #[cfg(test)]
 mod tests;
 
+pub use neighborhood::Offsets;
 pub use params::Params;
 
 use super::finish::finish;
@@ -96,8 +100,10 @@ fn most_rows(params: &Params, max_per_pixel: usize) -> usize {
     (0..params.boxes.len()).map(|t| params.neighbors(t, max_per_pixel)).max().unwrap_or(0)
 }
 
-/// The samples, and their pixels in the data window, that the draws around a pixel end at, before any is rejected.
+/// The samples, and their pixels in the data window, that the draws around a pixel end at, before any is rejected;
+/// `offsets` are those of iteration `t`.
 pub(super) fn draws(
+    offsets: &Offsets,
     tile: &SampleTile,
     params: &Params,
     seed: u64,
@@ -107,10 +113,9 @@ pub(super) fn draws(
 ) -> impl Iterator<Item = (usize, usize)> {
     let (image, window) = (tile.geometry().image(), tile.geometry().window());
     let own = tile.samples_of(window.index(x, y)).len();
-    let offsets = neighborhood::Offsets::new(params.boxes[t]);
     let center = neighborhood::Center { x, y, key: random::pixel_key(seed, x, y, t), wanted: params.neighbors(t, own) };
     (0..(center.wanted - own) as u64).filter_map(move |draw| {
-        let (pixel, bits) = neighborhood::candidate(&image, &window, &offsets, &center, draw)?;
+        let (pixel, bits) = neighborhood::candidate(&image, &window, offsets, &center, draw)?;
         let samples = tile.samples_of(pixel);
         (!samples.is_empty()).then(|| (pixel, neighborhood::pick_sample(bits, &samples) as usize))
     })
@@ -147,7 +152,7 @@ fn iterate(
     let iterations = params.boxes.len();
     for t in 0..iterations {
         let region = region(tile.geometry(), params, tile.varying(), t);
-        let offsets = neighborhood::Offsets::new(params.boxes[t]);
+        let offsets = Offsets::new(params.boxes[t]);
         let pass = Pass { tile, relevant: &relevant, params, t, execution, offsets, terms: &terms, colors: &colors };
         run(&pass, &region, &mut scratches, &mut next);
         if execution.stopped() {

@@ -23,7 +23,7 @@ const SLOTS: usize = 256;
 /// Offsets along one axis: a Gaussian with sigma = box / 4, rounded to whole pixels and held inside the box, as a table
 /// for Walker's alias method in Vose's form (1991). The two axes are independent, so one table serves both.
 #[derive(Clone, Debug)]
-pub(crate) struct Offsets {
+pub struct Offsets {
     /// Of each slot: the share (of 65536) in which it stands for `own`, else for `other`.
     slots: Box<[Slot; SLOTS]>,
 }
@@ -37,7 +37,7 @@ struct Slot {
 
 impl Offsets {
     /// The table for one box width.
-    pub(crate) fn new(width: u32) -> Self {
+    pub fn new(width: u32) -> Self {
         let radius = (width / 2) as i16;
         let probabilities: Vec<f64> = offset_probabilities(width);
         // Vose: slots that hold too little are topped up from one that holds too much.

@@ -106,6 +106,31 @@ fn threads_and_simd_levels_do_not_matter() {
     assert_ne!(other.rgb, run(&tile, &methods()[0]).rgb, "the seed matters");
 }
 
+/// Every preset as it is, at every level there is, with holes, and with and without what could be left out.
+#[test]
+fn simd_levels_do_not_matter_to_any_preset() {
+    let geometry = TileGeometry::with_halo([40, 30], Rect::new(8, 4, 12, 9), 6).unwrap();
+    let tile = Scene::by_name("all").unwrap().tile_varying(geometry, 5, &Execution::default()).unwrap();
+    let levels = SimdLevel::available();
+    println!("levels of this CPU: {}", SimdLevel::names().join(", "));
+    for (preset, _) in PRESETS {
+        for leave_out in [true, false] {
+            let at = |simd| {
+                let execution = Execution { seed: 5, simd, leave_out, ..Execution::default() };
+                filter(&tile, &method(preset, &[]), &execution).unwrap()
+            };
+            let expected = at(levels[0].1);
+            for (name, level) in &levels[1..] {
+                let filtered = at(*level);
+                for (plane, expected) in filtered.rgb.iter().zip(&expected.rgb) {
+                    assert!(bits(plane) == bits(expected), "{preset} at {name}, leaving out: {leave_out}");
+                }
+                assert_eq!(filtered.report, expected.report, "{preset} at {name}");
+            }
+        }
+    }
+}
+
 #[test]
 fn constant_colour_stays_exactly() {
     for (preset, _) in PRESETS {
