@@ -26,6 +26,9 @@ pub(crate) struct MethodArgs {
     /// Set one of the preset's parameters; may be given several times
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting, help = SET_HELP.as_str())]
     settings: Vec<(String, String)>,
+    /// Whether what can have no effect is left out, like planes that are constant: off takes longer, for the same image
+    #[arg(long, value_name = "on|off", default_value = "on", value_parser = ["on", "off"])]
+    leave_out: String,
 }
 
 static PRESET_HELP: LazyLock<String> = LazyLock::new(|| {
@@ -67,11 +70,17 @@ impl MethodArgs {
         Method::with(&self.preset, self.settings.iter().map(|(name, value)| (name, value)))
     }
 
-    /// As the service takes it: preset, seed, and the parameters that were set.
+    /// Whether what can have no effect is left out.
+    pub(crate) fn leave_out(&self) -> bool {
+        self.leave_out == "on"
+    }
+
+    /// As the service takes it: preset, seed, the parameters that were set, and that nothing is to be left out.
     pub(crate) fn to_json(&self, method: &Method) -> serde_json::Value {
         let settings = self.settings.iter().map(|(name, value)| (name.clone(), value.clone().into()));
         let own = [("preset".to_owned(), method.preset_name().into()), ("seed".to_owned(), self.seed.into())];
-        settings.chain(own).collect::<serde_json::Map<_, _>>().into()
+        let all = (!self.leave_out()).then(|| ("leave_out".to_owned(), false.into()));
+        settings.chain(own).chain(all).collect::<serde_json::Map<_, _>>().into()
     }
 }
 

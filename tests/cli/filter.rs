@@ -17,10 +17,18 @@ fn the_default_preset_denoises() {
     let left_out: Vec<_> =
         report["left_out"].as_array().unwrap().iter().map(|l| l["plane"].as_str().unwrap()).collect();
     assert_eq!(left_out, ["lens.0", "lens.1"]);
+    assert_eq!(report["left_out_bytes"], 2 * 48 * 48 * 4 * 4);
+    let work = |report: &Value, of: &[&str]| of.iter().map(|of| report["work"][of].as_u64().unwrap()).sum::<u64>();
+    let all_of_it = work(&report, &["done", "planes", "columns", "distances"]);
+    let share = work(&report, &["planes", "columns", "distances"]) as f64 / all_of_it as f64;
+    assert!(share > 0.1 && report["work"]["saved"].as_f64().unwrap() == share, "{}", report["work"]);
     let all = folder.path("all.exr");
     let report = json(["filter", input, "-o", &all, "--leave-out", "off"]);
     assert_eq!((&report["leave_out"], &report["left_out"]), (&false.into(), &Value::Array(Vec::new())));
+    assert_eq!((&report["left_out_bytes"], work(&report, &["done"])), (&0.into(), all_of_it));
     assert!(bytes(&all) == bytes(&out));
+    let said = String::from_utf8(rpfd(["filter", input, "-o", &all]).stdout).unwrap();
+    assert!(said.contains("constant: lens.0, lens.1") && said.contains("% of the work"), "{said}");
     assert!(bytes(&png).starts_with(b"\x89PNG"));
 
     let plain = folder.path("plain.exr");

@@ -7,9 +7,9 @@ use super::params::Params;
 use super::relevance::{Relevant, Source};
 use super::statistics::{Span, impute, normalise, pad, span};
 use super::weights::{Dependencies, Weights, steepness};
-use super::{grid::Grid, random, spikes};
+use super::{grid::Grid, random, spikes, work::Columns};
 use crate::filter::lanes::{Simd, padded};
-use crate::filter::{Execution, Plane, Rect, SampleTile};
+use crate::filter::{Execution, Plane, Rect, SampleTile, Work};
 
 /// All that a pass reads.
 pub(crate) struct Pass<'a> {
@@ -37,7 +37,11 @@ pub(crate) struct Scratch {
     histograms: Histograms,
     pub(super) dependencies: Dependencies,
     pub(crate) weights: Weights,
-    active: Vec<usize>,
+    pub(super) active: Vec<usize>,
+    /// Columns of the neighbourhood that were weighed, and are not constant there.
+    pub(super) varying: Columns,
+    /// What was done and left out in core pixels.
+    pub(super) work: Work,
     /// Values that the spike step replaced in core pixels.
     pub(crate) spikes: u64,
 }
@@ -73,6 +77,8 @@ impl Scratch {
             dependencies: Dependencies::new(relevant.features().len()),
             weights: Weights::new(relevant.features().len()),
             active: Vec::with_capacity(columns),
+            varying: Columns::default(),
+            work: Work::default(),
             spikes: 0,
         }
     }
@@ -156,15 +162,22 @@ impl Pass<'_> {
             let color = &self.colors[3 * sample as usize..][..3];
             (red[row], green[row], blue[row]) = (color[0], color[1], color[2]);
         }
-        [red, green, blue].map(|channel| {
-            let values = &mut channel[..padded(rows)];
-            pad(values, rows);
-            let span = span(simd, values);
-            if span.scale != 1.0 {
-                values.iter_mut().for_each(|v| *v *= span.scale);
+        let mut spans = [Span::default(); 3];
+        for (channel, values) in [red, green, blue].into_iter().enumerate() {
+            let twin = self.relevant.twins()[channel];
+            if twin < channel {
+                spans[channel] = spans[twin];
+                continue;
             }
-            span
-        })
+            let values = &mut values[..padded(rows)];
+            pad(values, rows);
+            spans[channel] = span(simd, values);
+            let scale = spans[channel].scale;
+            if scale != 1.0 {
+                values.iter_mut().for_each(|v| *v *= scale);
+            }
+        }
+        spans
     }
 
     /// A colour channel's normalised column, from the scaled radiance.
@@ -183,6 +196,7 @@ impl Pass<'_> {
         self.gather(scratch, x, y) && {
             let spans = self.load_radiance(simd, scratch);
             self.weigh_gathered(simd, scratch, &spans);
+            self.count_weighing(scratch, &spans, x, y);
             true
         }
     }
@@ -191,8 +205,10 @@ impl Pass<'_> {
     #[inline(always)]
     pub(super) fn weigh_gathered<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
         let order = ColumnOrder::of(self.relevant);
+        let twins = self.relevant.twins();
         let rows = scratch.rows.samples.len();
         scratch.histograms.start(rows);
+        let mut varying = Columns::default();
         simd.vectorize(
             #[inline(always)]
             || {
@@ -203,28 +219,47 @@ impl Pass<'_> {
                     let constant = self.load(simd, scratch, column, source, missing).constant();
                     let values = &scratch.columns[column * scratch.stride..][..padded(rows)];
                     scratch.histograms.set(simd, column, values, constant, self.terms);
+                    *match column {
+                        _ if column < order.random => &mut varying.positions,
+                        _ if column < order.features => &mut varying.random,
+                        _ => &mut varying.features,
+                    } += u64::from(!constant);
                 }
-                for (channel, span) in spans.iter().enumerate() {
+                for (channel, span) in spans.iter().enumerate().filter(|(channel, _)| twins[*channel] == *channel) {
                     let column = order.colors + channel;
                     self.load_color(simd, scratch, column, channel, span);
                     let values = &scratch.columns[column * scratch.stride..][..padded(rows)];
                     scratch.histograms.set(simd, column, values, span.constant(), self.terms);
+                    varying.colors += u64::from(!span.constant());
                 }
             },
         );
+        scratch.varying = varying;
         simd.vectorize(
             #[inline(always)]
             || {
                 let Scratch { histograms, dependencies, .. } = scratch;
                 let of = |x: usize, y: usize| histograms.information(x, y, self.terms);
                 for (channel, column) in (order.colors..order.end).enumerate() {
+                    let twin = twins[channel];
+                    if twin < channel {
+                        dependencies.color_position[channel] = dependencies.color_position[twin];
+                        dependencies.color_random[channel] = dependencies.color_random[twin];
+                        continue;
+                    }
                     dependencies.color_position[channel] = (0..order.random).map(|p| of(column, p)).sum();
                     dependencies.color_random[channel] = (order.random..order.features).map(|r| of(column, r)).sum();
                 }
                 for (feature, column) in (order.features..order.colors).enumerate() {
                     dependencies.feature_position[feature] = (0..order.random).map(|p| of(column, p)).sum();
                     dependencies.feature_random[feature] = (order.random..order.features).map(|r| of(column, r)).sum();
-                    dependencies.color_feature[feature] = (order.colors..order.end).map(|c| of(c, column)).sum();
+                    let mut on_colors = [0.0; 3];
+                    for channel in 0..3 {
+                        let twin = twins[channel];
+                        on_colors[channel] =
+                            if twin < channel { on_colors[twin] } else { of(order.colors + channel, column) };
+                    }
+                    dependencies.color_feature[feature] = on_colors.iter().sum();
                 }
             },
         );
@@ -251,6 +286,7 @@ impl Pass<'_> {
         let interpolated = grid.is_some_and(|grid| grid.interpolate(x, y, &mut scratch.weights));
         if !interpolated {
             self.weigh_gathered(simd, scratch, &spans);
+            self.count_weighing(scratch, &spans, x, y);
         }
         let rows = scratch.rows.samples.len();
         let steepness = steepness(scratch.weights.confidence, self.params.sigma8_squared, out.len() / 3);
@@ -270,9 +306,12 @@ impl Pass<'_> {
                 scratch.active.push(column);
             }
         }
+        let twins = self.relevant.twins();
         for (channel, span) in spans.iter().enumerate() {
             let factor = factor(scratch.weights.color[channel]);
-            if counts(factor) {
+            if counts(factor) && twins[channel] < channel {
+                scratch.active.push(order.colors + twins[channel]);
+            } else if counts(factor) {
                 let column = order.colors + channel;
                 if interpolated {
                     self.load_color(simd, scratch, column, channel, span);
@@ -287,12 +326,14 @@ impl Pass<'_> {
             active: &scratch.active,
             radiance: &scratch.radiance,
             spans: &spans,
+            twins,
             rows,
         };
         simd.vectorize(
             #[inline(always)]
             || bilateral::filter(simd, &distances, out),
         );
+        self.count_filtering(scratch, interpolated, x, y);
     }
 
     /// Filters the pixels of `band`. `out` holds the colours of its rows, from the data window's left edge to its right.

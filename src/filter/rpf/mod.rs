@@ -8,6 +8,7 @@
 //! | 4 weights | `weights.rs`, `grid.rs` |
 //! | 5 filter | `bilateral.rs` |
 //! | 6 spikes | `spikes.rs` |
+//! | what is left out | `relevance.rs`, and what that saves: `work.rs` |
 //! | iterations | `iteration.rs` (one pass), and this file |
 
 mod bilateral;
@@ -21,6 +22,7 @@ mod relevance;
 mod spikes;
 mod statistics;
 mod weights;
+pub(crate) mod work;
 
 #[cfg(test)]
 mod tests;
@@ -31,7 +33,7 @@ use super::finish::finish;
 use super::lanes::dispatch;
 use super::plan::{Plan, Shape};
 use super::share::share_out;
-use super::{Execution, Filtered, Plane, Rect, Report, SampleTile, Stopped, TileGeometry};
+use super::{Execution, Filtered, Plane, Rect, Report, SampleTile, Stopped, TileGeometry, Work};
 use grid::Grid;
 use iteration::{Pass, Scratch};
 use relevance::Relevant;
@@ -133,15 +135,18 @@ fn iterate(
         }
     }
     let spikes = scratches.iter().map(|scratch| scratch.spikes).sum();
+    let mut work = Work::default();
+    scratches.iter().for_each(|scratch| work += scratch.work);
     drop((scratches, next));
     let report = Report {
         replaced: tile.replaced(),
         spikes,
         halo: tile.geometry().halo(),
         halo_needed: tile.geometry().halo_for(params.reach(tile.varying())),
-        left_out: relevant.left_out,
+        work: Some(work),
         ..Report::default()
     };
+    let report = report.leaving_out(relevant.left_out, tile);
     Ok((colors, report))
 }
 

@@ -9,7 +9,7 @@
 use crate::filter::lanes::{LANES, Lanes, Simd, keep_first, prelude::*, sum};
 
 /// What a column's values span.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Span {
     /// Least value.
     pub(crate) min: f32,

@@ -4,8 +4,8 @@ use super::{method, part, scene};
 use crate::filter::geometry::tiling;
 use crate::filter::method::{Algorithm, PRESETS};
 use crate::filter::{
-    Channel, ChannelSet, Counts, Execution, Filtered, Halo, LeftOut, LeftOutReason, Method, Plane, Rect, Role,
-    SampleTile, SimdLevel, Stopped, TileGeometry, filter,
+    Channel, ChannelSet, Counts, Execution, Filtered, Halo, LeftOut, LeftOutReason, Method, Plane, Rect, Report, Role,
+    SampleTile, SimdLevel, Stopped, TileGeometry, Work, filter,
 };
 use crate::synth::Scene;
 use std::sync::atomic::AtomicBool;
@@ -170,6 +170,65 @@ fn planes_without_effect_change_no_bit() {
     }
 }
 
+/// What was done and what was left out is together what there is to do, which is done without leaving out.
+fn check_work(on: &Report, off: &Report, samples: usize) {
+    assert_eq!(on.left_out_bytes as usize, on.left_out.len() * samples * 4);
+    let (Some(on), Some(off)) = (on.work, off.work) else {
+        return assert_eq!((on.work, off.work), (None, None));
+    };
+    assert_eq!((off.saved(), off.saved_share()), (0, 0.0));
+    assert_eq!(on.done + on.saved(), off.done);
+    assert!(on.saved() > 0 && on.done > 0 && (0.0..1.0).contains(&on.saved_share()), "{on:?}");
+}
+
+/// Each cause of leaving out saves its own, and the work of tiles adds up to that of the whole image.
+#[test]
+fn work_is_told_by_cause_and_adds_up() {
+    let image = [40, 30];
+    let geometry = |core, halo| TileGeometry::with_halo(image, core, halo).unwrap();
+    let whole = Rect::new(0, 0, 40, 30);
+    for settings in [&[][..], &[("information_grid", "1")]] {
+        let method = method("lean", settings);
+        let work = |core: Rect, plane: &dyn Fn(usize, &SampleTile) -> Plane| {
+            let full = part("all", geometry(core, method.reach(false)), 3);
+            let planes = (0..full.channels().planes()).map(|k| plane(k, &full)).collect();
+            let tile = SampleTile::new(*full.geometry(), full.channels().clone(), Counts::Uniform(3), planes).unwrap();
+            run(&tile, &method).report.work.unwrap()
+        };
+        let as_it_is = |k: usize, tile: &SampleTile| tile.plane(k).clone();
+        let plain = work(whole, &as_it_is);
+        assert_eq!(plain.planes, 0, "nothing is constant all over");
+        // A random parameter that is constant all over; one that is a step at the right edge, so over most neighbourhoods;
+        // a colour that is one, too, and so depends on it alone and weighs nothing.
+        let time = scene("all", [8, 8], 1).channels().planes_of(|role| matches!(role, Role::Random { .. }))[0];
+        let constant = |k: usize, tile: &SampleTile| match k {
+            k if k == time => Plane::Constant(0.5),
+            k => tile.plane(k).clone(),
+        };
+        let step = |k: usize, tile: &SampleTile| match k {
+            k if k == time => {
+                let last = |s: usize| s / 3 % tile.geometry().window().width as usize == 39;
+                Plane::Values((0..tile.total()).map(|s| f32::from(last(s))).collect())
+            }
+            k => tile.plane(k).clone(),
+        };
+        let noise = |k: usize, tile: &SampleTile| match k {
+            k if tile.channels().color_planes().contains(&k) => {
+                Plane::Values((0..tile.total()).map(|s| tile.value(time, s) * k as f32).collect())
+            }
+            k => tile.plane(k).clone(),
+        };
+        let (constant, step, noise) = (work(whole, &constant), work(whole, &step), work(whole, &noise));
+        assert!(constant.planes > 0, "{constant:?}");
+        assert!(step.planes == 0 && step.columns > plain.columns && step.distances > 0, "{plain:?} {step:?}");
+        assert!(noise.distances > plain.distances, "{plain:?} {noise:?}");
+        let mut sum = Work::default();
+        tiling(image, 16).for_each(|core| sum += work(core, &as_it_is));
+        assert_eq!(sum.done + sum.saved(), plain.done + plain.saved());
+        assert_eq!(sum.distances, plain.distances);
+    }
+}
+
 /// Computing what can have no effect changes no bit: constant and missing planes of every role, columns that are constant
 /// over a neighbourhood only, features and colours that weigh nothing. Random planes come and go, and so do threads.
 #[test]
@@ -207,8 +266,54 @@ fn leaving_out_changes_no_bit() {
                 assert_eq!(on.report.spikes, off.report.spikes);
                 let unused = |l: &LeftOut| l.reason == LeftOutReason::Unused;
                 assert!(off.report.left_out.iter().all(unused), "{:?}", off.report.left_out);
+                check_work(&on.report, &off.report, tile.total());
                 let constant = |r: &Filtered| r.report.left_out.iter().any(|l| !unused(l));
                 assert!(!constant(&off) && (constant(&on) || !matches!(method.algorithm(), Algorithm::Rpf(_))));
+            }
+        }
+    }
+}
+
+/// Colour channels that are equal are computed once, for the bits of computing each: all three, as in a grey scene, or
+/// any two; among them constant ones, missing features, and pixels with different numbers of samples.
+#[test]
+fn equal_colours_are_computed_once() {
+    let geometry = TileGeometry::new([26, 22], Rect::new(0, 0, 26, 22), Halo::default()).unwrap();
+    let fixed = scene("all", [26, 22], 3);
+    let varying = Scene::by_name("all").unwrap().tile_varying(geometry, 4, &Execution::default()).unwrap();
+    for (noisy, counts) in [
+        (&fixed, Counts::Uniform(3)),
+        (&varying, Counts::Varying((0..26 * 22).map(|p| varying.samples_of(p).len() as u16).collect())),
+    ] {
+        let colors = noisy.channels().color_planes();
+        for (sources, equal) in [
+            ([0, 0, 0], &["color.1", "color.2"][..]),
+            ([1, 1, 2], &["color.1"]),
+            ([0, 1, 0], &["color.2"]),
+            ([2, 1, 1], &["color.2"]),
+            ([0, 1, 2], &[]),
+        ] {
+            let plane = |plane: usize| match colors.iter().position(|&color| color == plane) {
+                Some(channel) => noisy.plane(colors[sources[channel]]).clone(),
+                None => noisy.plane(plane).clone(),
+            };
+            let planes = (0..noisy.channels().planes()).map(plane).collect();
+            let tile = SampleTile::new(*noisy.geometry(), noisy.channels().clone(), counts.clone(), planes).unwrap();
+            for method in methods() {
+                let on = run(&tile, &method);
+                let execution = Execution { seed: 5, leave_out: false, ..Execution::default() };
+                let off = filter(&tile, &method, &execution).unwrap();
+                assert!(on.rgb.iter().zip(&off.rgb).all(|(on, off)| bits(on) == bits(off)), "{sources:?}, {method:?}");
+                assert_eq!(on.report.spikes, off.report.spikes);
+                for (k, l) in [(0, 1), (0, 2), (1, 2)] {
+                    assert_eq!(sources[k] == sources[l], bits(&on.rgb[k]) == bits(&on.rgb[l]));
+                }
+                let said = on.report.left_out.iter().filter(|l| l.reason == LeftOutReason::Equal);
+                let said: Vec<_> = said.map(|l| l.plane.as_str()).collect();
+                let rpf = matches!(method.algorithm(), Algorithm::Rpf(_));
+                assert_eq!(said, if rpf { equal } else { &[] });
+                check_work(&on.report, &off.report, tile.total());
+                assert!(off.report.left_out.iter().all(|l| l.reason == LeftOutReason::Unused));
             }
         }
     }
