@@ -295,6 +295,8 @@ impl Run {
             "left_out": left_out
                 .map(|((plane, reason), tiles)| json!({ "plane": plane, "reason": reason, "tiles": tiles }))
                 .collect::<Vec<_>>(),
+            "settled": totals.settled,
+            "settled_error": totals.settled_error,
             "left_out_bytes": totals.left_out_bytes,
             "work": totals.work.map(WorkCounts::from),
             "memory": { "limit": offline.memory.0, "planned": self.schedule.bytes },
@@ -343,6 +345,15 @@ fn print_summary(args: &Args, run: &Run, seconds: f64) {
     if let Some(work) = totals.work.filter(|work| work.saved() > 0) {
         let bytes = HumanBytes(totals.left_out_bytes);
         say!("which saved about {:.0} % of the work, and {bytes} of planes", 100.0 * work.saved_share());
+    }
+    if totals.settled > 0 {
+        let (share, error) =
+            (totals.settled as f64 / totals.pixels as f64, totals.settled_error / totals.pixels as f64);
+        let percent = 100.0 * share;
+        say!(
+            "{} pixels ({percent:.1} %) were within the tolerance and passed through: relMSE + {error:.2e} at most, on average",
+            totals.settled
+        );
     }
     if totals.replaced.total() > 0 {
         say!("{} values were not finite and were replaced", totals.replaced.total());

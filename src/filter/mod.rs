@@ -115,6 +115,11 @@ pub struct Report {
     pub filled: u64,
     /// Pixels without samples that stayed black, since no neighbour had any.
     pub unfilled: u64,
+    /// Pixels with samples that were passed through, since filtering could take less than the tolerance off their relMSE.
+    pub settled: u64,
+    /// Sum over these pixels of what filtering could have taken off at most, by estimate: divided by the number of all
+    /// pixels it is what the image's relMSE may be higher for it.
+    pub settled_error: f64,
     /// The halo that the tile had.
     pub halo: Halo,
     /// The halo that it would need for the same bits as in the whole image.

@@ -222,6 +222,8 @@ impl Image {
             "energy_out": totals.energy_out,
             "filled": totals.filled,
             "unfilled": totals.unfilled,
+            "settled": totals.settled,
+            "settled_error": totals.settled_error,
             "short_of_halo": totals.short_of_halo,
             "halo_needed": [needed.left, needed.top, needed.right, needed.bottom],
             "left_out_bytes": totals.left_out_bytes,

@@ -196,6 +196,10 @@ pub struct Totals {
     pub filled: u64,
     /// Pixels without samples that stayed black.
     pub unfilled: u64,
+    /// Pixels that were passed through, within the tolerance.
+    pub settled: u64,
+    /// Sum over these of the relMSE that filtering could have taken off at most, by estimate.
+    pub settled_error: f64,
     /// Tiles that had less halo than the method reads.
     pub short_of_halo: u64,
     /// The widest halo that a tile would have needed, by side.
@@ -221,6 +225,8 @@ impl Totals {
         self.filled += report.filled;
         self.unfilled += report.unfilled;
         self.short_of_halo += u64::from(!report.exact());
+        self.settled += report.settled;
+        self.settled_error += report.settled_error;
         self.left_out_bytes += report.left_out_bytes;
         if let Some(work) = report.work {
             *self.work.get_or_insert_default() += work;

@@ -76,6 +76,10 @@ pub struct TileReport {
     pub filled: u64,
     /// Pixels without samples that stayed black.
     pub unfilled: u64,
+    /// Pixels that were passed through, within the tolerance.
+    pub settled: u64,
+    /// Sum over these of the relMSE that filtering could have taken off at most, by estimate.
+    pub settled_error: f64,
     /// The halo that the tile had: left, top, right, bottom, in pixels.
     pub halo: [u32; 4],
     /// The halo that it would need for the same bits as in the whole image.
@@ -156,6 +160,8 @@ impl TileReport {
             energy_ratio: ratio.is_finite().then_some(ratio),
             filled: report.filled,
             unfilled: report.unfilled,
+            settled: report.settled,
+            settled_error: report.settled_error,
             halo: sides(report.halo),
             halo_needed: sides(report.halo_needed),
             exact: report.exact(),

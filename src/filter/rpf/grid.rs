@@ -56,6 +56,7 @@ impl Grid {
             columns: (0..self.size[0] as u32).map(|i| self.position(self.first[0] + i, self.image.width)).collect(),
             rows: (0..self.size[1] as u32).map(|i| self.position(self.first[1] + i, self.image.height)).collect(),
             values: FIXED + self.features,
+            spacing: self.spacing,
         };
         let length = self.size[0] * rows.values;
         (rows, self.nodes.chunks_exact_mut(length).enumerate())
@@ -109,16 +110,25 @@ pub(crate) struct GridRows {
     columns: Vec<u32>,
     rows: Vec<u32>,
     values: usize,
+    spacing: u32,
 }
 
 impl GridRows {
+    /// Whether any pixel that the node's weights are interpolated for is filtered at all.
+    fn needed(&self, pass: &Pass, x: u32, y: u32) -> bool {
+        let around = Rect::new(x, y, 1, 1).grown(self.spacing - 1, &pass.tile.geometry().window());
+        let mut rows = around.y..around.bottom();
+        pass.settled.is_empty() || rows.any(|y| (around.x..around.right()).any(|x| !pass.settled(x, y)))
+    }
+
     /// Computes the weights of one row of nodes.
     #[inline(always)]
     pub(crate) fn weigh<S: Simd>(&self, simd: S, pass: &Pass, scratch: &mut Scratch, row: usize, nodes: &mut [f32]) {
         let y = self.rows[row];
         let window = pass.tile.geometry().window();
         for (&x, node) in self.columns.iter().zip(nodes.chunks_exact_mut(self.values)) {
-            if !pass.execution.stopped() && window.contains(x, y) && pass.weigh(simd, scratch, x, y) {
+            let here = !pass.execution.stopped() && window.contains(x, y) && self.needed(pass, x, y);
+            if here && pass.weigh(simd, scratch, x, y) {
                 let Weights { color, features, confidence } = &scratch.weights;
                 node[..3].copy_from_slice(color);
                 node[3] = *confidence;

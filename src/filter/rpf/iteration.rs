@@ -23,6 +23,8 @@ pub(crate) struct Pass<'a> {
     pub(crate) offsets: Offsets,
     /// n ln n.
     pub(crate) terms: &'a [f64],
+    /// Of each pixel of the data window whether it is passed through; may be empty.
+    pub(crate) settled: &'a [bool],
     /// Colours after the iteration before: R, G, B of each sample next to each other.
     pub(crate) colors: &'a [f32],
 }
@@ -97,6 +99,11 @@ impl Scratch {
 }
 
 impl Pass<'_> {
+    /// Whether a pixel is passed through.
+    pub(super) fn settled(&self, x: u32, y: u32) -> bool {
+        self.settled.get(self.tile.geometry().window().index(x, y)) == Some(&true)
+    }
+
     /// Draws the neighbourhood of a pixel; false if it has no samples.
     pub(super) fn gather(&self, scratch: &mut Scratch, x: u32, y: u32) -> bool {
         let own = self.tile.samples_of(self.tile.geometry().window().index(x, y)).len();
@@ -356,6 +363,10 @@ impl Pass<'_> {
                 }
                 let samples = self.tile.samples_of(window.index(x, y));
                 let out = &mut out[3 * (samples.start - start)..3 * (samples.end - start)];
+                if self.settled(x, y) {
+                    out.copy_from_slice(&self.colors[3 * samples.start..3 * samples.end]);
+                    continue;
+                }
                 self.pixel(simd, scratch, grid, x, y, out);
                 if self.params.spikes {
                     let spikes = spikes::tame(out);

@@ -9,6 +9,7 @@
 //! | 5 filter | `bilateral.rs` |
 //! | 6 spikes | `spikes.rs` |
 //! | what is left out | `relevance.rs`, and what that saves: `work.rs` |
+//! | what is passed through on request | `settled.rs` |
 //! | iterations | `iteration.rs` (one pass), and this file |
 
 mod bilateral;
@@ -19,6 +20,7 @@ mod neighborhood;
 pub mod params;
 mod random;
 mod relevance;
+mod settled;
 mod spikes;
 mod statistics;
 mod weights;
@@ -54,12 +56,13 @@ pub(super) fn plan(shape: &Shape, params: &Params) -> Plan {
     let film = shape.channels.planes_of(|role| matches!(role, super::Role::Film)).len();
     let columns = shape.channels.planes() + 2 - film;
     let rows = most_rows(params, shape.max_per_pixel as usize);
+    let pixels = shape.geometry.window().area();
     let grid = match params.information_grid {
         1 => 0,
         spacing => Grid::bytes(spacing, &region(shape.geometry, params, shape.varying, 0), features),
     };
     Plan {
-        working: shape.samples * 2 * 3 * 4 + grid + (rows as u64 + 1) * 8,
+        working: shape.samples * 2 * 3 * 4 + grid + (rows as u64 + 1) * 8 + settled::bytes(params, pixels),
         per_thread: Scratch::bytes(columns, features, rows, params.bins),
         ..Plan::default()
     }
@@ -117,13 +120,15 @@ fn iterate(
     let threads = execution.threads();
     let mut scratches = Vec::with_capacity(threads);
     scratches.resize_with(threads, || Scratch::new(&relevant, rows, params.bins, execution.leave_out));
+    let settled = settled::settled(tile, params);
     let mut colors = interleaved_colors(tile);
     let mut next = vec![0.0; colors.len()];
     let iterations = params.boxes.len();
     for t in 0..iterations {
         let region = region(tile.geometry(), params, tile.varying(), t);
         let offsets = neighborhood::Offsets::new(params.boxes[t]);
-        let pass = Pass { tile, relevant: &relevant, params, t, execution, offsets, terms: &terms, colors: &colors };
+        let (relevant, terms, settled) = (&relevant, &terms, &settled);
+        let pass = Pass { tile, relevant, params, t, execution, offsets, terms, settled, colors: &colors };
         run(&pass, &region, &mut scratches, &mut next);
         if execution.stopped() {
             return Err(Stopped);
@@ -138,8 +143,13 @@ fn iterate(
     let mut work = Work::default();
     scratches.iter().for_each(|scratch| work += scratch.work);
     drop((scratches, next));
+    let (core, window) = (tile.geometry().core(), tile.geometry().window());
+    let inside = (core.y..core.bottom()).flat_map(|y| (core.x..core.right()).map(move |x| window.index(x, y)));
+    let settled = inside.filter(|&pixel| settled.get(pixel) == Some(&true) && !tile.samples_of(pixel).is_empty());
     let report = Report {
         replaced: tile.replaced(),
+        settled: settled.clone().count() as u64,
+        settled_error: settled.fold(0.0, |sum, pixel| sum + settled::error(tile, pixel)),
         spikes,
         halo: tile.geometry().halo(),
         halo_needed: tile.geometry().halo_for(params.reach(tile.varying())),

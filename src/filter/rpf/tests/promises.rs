@@ -16,12 +16,13 @@ fn run(tile: &SampleTile, method: &Method) -> Filtered {
 
 /// The methods that tiling and threads are tried with: presets as they are where their reach fits a small image, else
 /// with smaller boxes; and the baselines.
-fn methods() -> [Method; 7] {
+fn methods() -> [Method; 8] {
     let small = [("boxes", "15,9,7,5"), ("fractions", "0.05,0.1,0.3,0.5")];
     [
         method("lean", &[]),
         method("paper-fast", &small),
         method("paper-fast", &[small[0], small[1], ("spikes", "off"), ("information_grid", "3")]),
+        method("lean", &[("tolerance", "0.02")]),
         method("gaussian", &[("sigma", "2.5")]),
         method("bilateral", &[("sigma", "3"), ("color_scale", "linear")]),
         method("bilateral", &[("color_scale", "log"), ("color_sigma", "0.3")]),
@@ -401,14 +402,53 @@ fn partly_missing_features_give_the_whole_images_bits() {
     }
 }
 
+/// With a tolerance the pixels that filtering could help little stay exactly as they are, and are counted; 0 is as
+/// without. What nodes only settled pixels would ask for is not computed: there is less work.
+#[test]
+fn settled_pixels_are_passed_through() {
+    let tile = scene("all", [40, 30], 6);
+    for preset in ["lean", "paper-fast"] {
+        let settings = [("boxes", "15,9,7,5"), ("fractions", "0.05,0.1,0.3,0.5")];
+        let settings: &[_] = if preset == "lean" { &[] } else { &settings };
+        let with = |tolerance| {
+            let settings: Vec<_> = settings.iter().copied().chain([("tolerance", tolerance)]).collect();
+            run(&tile, &method(preset, &settings))
+        };
+        let plain = run(&tile, &method(preset, settings));
+        assert_eq!(with("0"), plain);
+        assert_eq!((plain.report.settled, plain.report.settled_error), (0, 0.0));
+        let before = run(&tile, &method("unfiltered", &[]));
+        let (mut last, mut work) = (0, plain.report.work.unwrap().done);
+        for (tolerance, limit) in [("0.001", 0.001), ("0.03", 0.03), ("1", 1.0)] {
+            let filtered = with(tolerance);
+            let Report { settled, settled_error, .. } = filtered.report;
+            let same = (0..40 * 30).filter(|&p| (0..3).all(|k| filtered.rgb[k][p] == before.rgb[k][p])).count() as u64;
+            assert!(settled >= last && same >= settled, "{settled} settled, {same} the same, {last} before");
+            assert!(settled_error >= 0.0 && (settled_error < limit * settled as f64 || settled == 0));
+            let done = filtered.report.work.unwrap().done;
+            assert!(done <= work, "{done} {work}");
+            assert!(tolerance != "0.03" || settled > 100 && settled < 40 * 30, "{settled}");
+            (last, work) = (settled, done);
+        }
+    }
+    // One sample says nothing of its noise; without any there is nothing to pass through.
+    let one = run(&scene("all", [20, 14], 1), &method("lean", &[("tolerance", "1")]));
+    assert_eq!(one.report.settled, 0);
+    let none = without_samples(16);
+    assert_eq!(run(&none, &method("lean", &[("tolerance", "1")])).report.settled, 0);
+}
+
 /// Hole filling looks no further than it has to: this would take hours if it did.
 #[test]
 fn an_empty_tile_is_quick_whatever_the_box() {
     let method = method("lean", &[("boxes", "255"), ("fractions", "0")]);
-    let geometry = TileGeometry::with_halo([512, 512], Rect::new(0, 0, 512, 512), 0).unwrap();
+    assert_eq!(run(&without_samples(512), &method).report.unfilled, 512 * 512);
+}
+
+fn without_samples(side: u32) -> SampleTile {
+    let geometry = TileGeometry::with_halo([side, side], Rect::new(0, 0, side, side), 0).unwrap();
     let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
-    let tile = SampleTile::new(geometry, channels, Counts::Uniform(0), vec![Plane::Constant(0.0); 3]).unwrap();
-    assert_eq!(run(&tile, &method).report.unfilled, 512 * 512);
+    SampleTile::new(geometry, channels, Counts::Uniform(0), vec![Plane::Constant(0.0); 3]).unwrap()
 }
 
 /// The plainest tiles there are: no film, no features, no random parameters; one or no sample; one pixel.
