@@ -102,6 +102,7 @@ fn plans_are_upper_bounds_and_tight() {
     let quick = [("fractions", "0.002,0.004,0.03,0.05")];
     let methods = [
         Method::preset("lean").expect("a preset"),
+        Method::with("lean", [("tolerance", "0.5")]).expect("valid"),
         Method::preset("unfiltered").expect("a preset"),
         Method::with("gaussian", [("sigma", "5")]).expect("valid"),
         Method::with("bilateral", [("color_scale", "log")]).expect("valid"),

@@ -13,6 +13,7 @@ use crate::{
     picture::write_png,
     stitch::{ExrOptions, Offer, Pixels, Stitcher, atomic::AtomicFile},
     store::spool::Spool,
+    wire::message::WorkCounts,
 };
 use indicatif::{HumanBytes, ProgressBar};
 use serde_json::{Value, json};
@@ -56,9 +57,6 @@ pub(crate) struct Args {
     threads: ThreadArgs,
     #[command(flatten)]
     simd: SimdArgs,
-    /// Whether what can have no effect is left out, like planes that are constant: off takes longer, for the same file
-    #[arg(long, value_name = "on|off", default_value = "on", value_parser = ["on", "off"])]
-    leave_out: String,
     /// Print what was done as JSON
     #[arg(long)]
     pub(crate) json: bool,
@@ -89,7 +87,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let offline = Offline {
         method,
         seed: args.method.seed,
-        leave_out: args.leave_out == "on",
+        leave_out: args.method.leave_out(),
         simd: args.simd.level,
         threads: args.threads.count(),
         pool: args.threads.pool()?,
@@ -302,9 +300,24 @@ impl Run {
             "left_out": left_out
                 .map(|((plane, reason), tiles)| json!({ "plane": plane, "reason": reason, "tiles": tiles }))
                 .collect::<Vec<_>>(),
+            "settled": totals.settled,
+            "settled_error": totals.settled_error,
+            "left_out_bytes": totals.left_out_bytes,
+            "work": totals.work.map(WorkCounts::from),
             "memory": { "limit": offline.memory.0, "planned": self.schedule.bytes },
             "spool": spooled,
         })
+    }
+}
+
+/// Why planes were left out.
+fn reason_in_words(reason: &str) -> &str {
+    match reason {
+        "constant" => "they are constant",
+        "missing" => "no sample has them",
+        "unused" => "the method does not look at them",
+        "equal" => "they equal an earlier colour plane",
+        other => other,
     }
 }
 
@@ -327,6 +340,26 @@ fn print_summary(args: &Args, run: &Run, seconds: f64) {
         totals.energy_out / totals.energy_in,
         totals.spikes
     );
+    let mut left_out: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for (plane, reason) in run.stitcher.left_out().keys() {
+        left_out.entry(reason).or_default().push(plane);
+    }
+    for (reason, planes) in left_out {
+        say!("left out, since {}: {}", reason_in_words(reason), planes.join(", "));
+    }
+    if let Some(work) = totals.work.filter(|work| work.saved() > 0) {
+        let bytes = HumanBytes(totals.left_out_bytes);
+        say!("which saved about {:.0} % of the work, and {bytes} of planes", 100.0 * work.saved_share());
+    }
+    if totals.settled > 0 {
+        let (share, error) =
+            (totals.settled as f64 / totals.pixels as f64, totals.settled_error / totals.pixels as f64);
+        let percent = 100.0 * share;
+        say!(
+            "{} pixels ({percent:.1} %) were within the tolerance and passed through: relMSE + {error:.2e} at most, on average",
+            totals.settled
+        );
+    }
     if totals.replaced.total() > 0 {
         say!("{} values were not finite and were replaced", totals.replaced.total());
     }

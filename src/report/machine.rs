@@ -41,6 +41,20 @@ impl Machine {
     }
 }
 
+impl Machine {
+    /// The version of the program, and what tells this build of it from any other: BLAKE3 of its file, where that can be
+    /// read. Times measured by another build are not this one's.
+    pub fn build() -> String {
+        let version = env!("CARGO_PKG_VERSION");
+        let hash = || {
+            let mut hasher = blake3::Hasher::new();
+            hasher.update_reader(fs::File::open(std::env::current_exe().ok()?).ok()?).ok()?;
+            Some(hasher.finalize().to_hex()[..16].to_owned())
+        };
+        hash().map_or_else(|| version.to_owned(), |hash| format!("{version}+{hash}"))
+    }
+}
+
 /// Seconds of processor time that all threads of this process have used, in user and system mode.
 pub fn cpu_seconds() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);

@@ -33,7 +33,7 @@ pub struct Key {
     pub seed: u64,
     /// 0 for the first time the same is measured.
     pub repeat: u32,
-    /// Version of the program.
+    /// Version and build of the program.
     pub version: String,
 }
 

@@ -17,18 +17,38 @@ fn the_default_preset_denoises() {
     let left_out: Vec<_> =
         report["left_out"].as_array().unwrap().iter().map(|l| l["plane"].as_str().unwrap()).collect();
     assert_eq!(left_out, ["lens.0", "lens.1"]);
+    assert_eq!(report["left_out_bytes"], 2 * 48 * 48 * 4 * 4);
+    let work = |report: &Value, of: &[&str]| of.iter().map(|of| report["work"][of].as_u64().unwrap()).sum::<u64>();
+    let all_of_it = work(&report, &["done", "planes", "columns", "distances"]);
+    let share = work(&report, &["planes", "columns", "distances"]) as f64 / all_of_it as f64;
+    assert!(share > 0.05 && report["work"]["saved"].as_f64().unwrap() == share, "{}", report["work"]);
     let all = folder.path("all.exr");
     let report = json(["filter", input, "-o", &all, "--leave-out", "off"]);
     assert_eq!((&report["leave_out"], &report["left_out"]), (&false.into(), &Value::Array(Vec::new())));
+    assert_eq!((&report["left_out_bytes"], work(&report, &["done"])), (&0.into(), all_of_it));
     assert!(bytes(&all) == bytes(&out));
+    let said = String::from_utf8(rpfd(["filter", input, "-o", &all]).stdout).unwrap();
+    assert!(said.contains("constant: lens.0, lens.1") && said.contains("% of the work"), "{said}");
     assert!(bytes(&png).starts_with(b"\x89PNG"));
+
+    let rough = folder.path("rough.exr");
+    let report = json(["filter", input, "-o", &rough, "--tolerance", "0.1"]);
+    assert_eq!(report["parameters"]["tolerance"], "0.1");
+    let settled = report["settled"].as_u64().unwrap();
+    assert!(settled > 0 && report["settled_error"].as_f64().unwrap() < 0.1 * settled as f64, "{report}");
+    assert!(bytes(&rough) != bytes(&out));
+    let said = String::from_utf8(rpfd(["filter", input, "-o", &rough, "--tolerance", "0.1"]).stdout).unwrap();
+    assert!(said.contains(&format!("{settled} pixels")), "{said}");
+    assert_eq!(fails(2, ["filter", input, "-o", &rough, "--tolerance", "2"]).0, "parameter");
+    assert_eq!(fails(2, ["filter", input, "-o", &rough, "--preset", "gaussian", "--tolerance", "0.1"]).0, "parameter");
 
     let plain = folder.path("plain.exr");
     json(["filter", input, "-o", &plain, "--preset", "unfiltered"]);
     let reference = read_exr(data("small.reference.exr"));
     let error = |path: &str| errors(&read_exr(path).pixels, &reference.pixels).unwrap().relmse;
+    assert!(error(&rough) < error(&out) + 0.1);
     assert!(error(&out) < 0.5 * error(&plain), "{} against {}", error(&out), error(&plain));
-    assert_eq!(folder.names(), ["all.exr", "out.exr", "out.png", "plain.exr"]);
+    assert_eq!(folder.names(), ["all.exr", "out.exr", "out.png", "plain.exr", "rough.exr"]);
 }
 
 /// Bare cores, tiles with halo, one huge tile, shuffled tiles, memory that is plenty or scarce, one thread or two.

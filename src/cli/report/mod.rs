@@ -61,6 +61,9 @@ pub(crate) struct Args {
     /// --crop
     #[arg(long = "preset", value_name = "NAME[:K=V,...]")]
     presets: Vec<String>,
+    /// Measure each method that has a tolerance with these as well (lean:tolerance=1e-3), and compare
+    #[arg(long, value_name = "E,...", value_delimiter = ',')]
+    tolerance: Vec<String>,
     /// Samples per pixel; by default as many as the files have, and 8 of --synth
     #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=65535))]
     spp: Vec<u32>,
@@ -156,8 +159,17 @@ impl Args {
         };
         let mut methods = vec![named(BASE)?];
         for text in wanted {
-            if !methods.iter().any(|known| known.label == text) {
-                methods.push(named(&text)?);
+            let method = named(&text)?;
+            let has = method.method.parameters().iter().any(|(name, _)| *name == "tolerance");
+            let tolerances = self.tolerance.iter().filter(|_| has).map(|e| {
+                let comma = if text.contains(':') { ',' } else { ':' };
+                named(&format!("{text}{comma}tolerance={e}"))
+            });
+            for method in [Ok(method)].into_iter().chain(tolerances) {
+                let method = method?;
+                if !methods.iter().any(|known| known.label == method.label) {
+                    methods.push(method);
+                }
             }
         }
         Ok(methods)
@@ -253,6 +265,7 @@ fn state_failure(path: &Path, error: &std::io::Error) -> Failure {
 /// Everything that is to be measured, in the order of the report.
 fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Failure> {
     let mut jobs = Vec::new();
+    let version = Machine::build();
     for (index, set) in sets.iter().enumerate() {
         let image = Rect::new(0, 0, set.image[0], set.image[1]);
         if let Some(part) = args.crop.filter(|part| image.intersection(part) != Some(*part)) {
@@ -285,7 +298,7 @@ fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Fa
                         simd: args.simd.level.name().to_owned(),
                         seed: args.seed,
                         repeat,
-                        version: env!("CARGO_PKG_VERSION").to_owned(),
+                        version: version.clone(),
                     };
                     let keys = args.threads.iter().flat_map(|&t| (0..args.repeats).map(move |r| (t, r)));
                     let job = |(t, r)| Job { set: index, source, part, method: number, key: key(t, r) };
@@ -420,9 +433,13 @@ fn write(
     }
     let Machine { cpu, cores, simd, os, version } = &machine;
     println!("{version} on {cpu}, {cores} processors, SIMD {simd}, {os}\n");
-    print!("{}", table::text(rows, seconds_per_sample));
+    print!("{}", table::text(&table::cells(rows, seconds_per_sample)));
     let notes = &table::NOTES[..if seconds_per_sample.is_some() { 6 } else { 5 }];
     println!("\n{}", notes.join("\n"));
+    let tables = [(table::tolerances(rows), table::TOLERANCE_NOTE), (table::left_out(rows), table::LEFT_OUT_NOTE)];
+    for (table, note) in tables.iter().filter(|((_, cells), _)| !cells.is_empty()) {
+        println!("\n{}\n{note}", table::text(table));
+    }
     let unlike = rows.iter().filter(|row| !row.repeatable);
     unlike.for_each(|row| println!("NOT REPEATABLE: the errors of {} on {} differ", row.label, row.key.data));
     for path in [&args.csv, &args.html, &args.svg].into_iter().flatten() {

@@ -14,6 +14,9 @@ const NEAR_CLUSTER: f64 = 1e-9;
 /// Within this of the spike limit, relative to the pixel's size, a sample may be a spike or not in f32.
 const NEAR_SPIKE: f64 = 1e-5;
 
+/// Errors of pixels are computed in f64 by both, too.
+const NEAR_SETTLED: f64 = 1e-9;
+
 /// Colours R, G, B.
 type Color = [f64; 3];
 
@@ -188,6 +191,37 @@ impl<'a> Whole<'a> {
         Some((Weights { alpha, beta, color_on_random: 1.0 - (confidence / total).sqrt() }, near))
     }
 
+    /// Whether a pixel is passed through: its mean, and those of the pixels around it, are good enough by themselves. And
+    /// how many of these decisions were near.
+    fn settled(&self, x: u32, y: u32) -> (bool, u32) {
+        let tolerance = self.params.tolerance;
+        if tolerance == 0.0 {
+            return (false, 0);
+        }
+        let window = self.tile.geometry().window();
+        let (mut settled, mut near) = (true, 0);
+        for y in y.saturating_sub(1)..=y + 1 {
+            for x in x.saturating_sub(1)..=x + 1 {
+                let own = if window.contains(x, y) { self.tile.samples_of(window.index(x, y)) } else { 0..0 };
+                let error = match own.len() {
+                    0 => 0.0,
+                    1 => f64::INFINITY,
+                    n => {
+                        let of = |plane: &usize| {
+                            let values = self.plane(*plane, &own.clone().collect::<Vec<_>>());
+                            // The variance with n - 1, of the mean, relative.
+                            deviation(&values).powi(2) / (n as f64 - 1.0) / (mean(&values).powi(2) + 0.01)
+                        };
+                        mean(&self.tile.channels().color_planes().iter().map(of).collect::<Vec<_>>())
+                    }
+                };
+                settled &= error < tolerance;
+                near += u32::from((error - tolerance).abs() < NEAR_SETTLED * tolerance);
+            }
+        }
+        (settled, near)
+    }
+
     /// Iteration `t` from these colours.
     pub fn step(&self, t: usize, colors: &[Color]) -> Step {
         let (window, region) = (self.tile.geometry().window(), self.region(t));
@@ -198,6 +232,13 @@ impl<'a> Whole<'a> {
             for x in region.x..region.right() {
                 let at = window.index(x, y);
                 let own = self.tile.samples_of(at);
+                let (settled, near_settled) = self.settled(x, y);
+                if settled {
+                    let absolute = |k: usize| own.clone().map(|s| colors[s][k].abs()).collect::<Vec<_>>();
+                    step.size[at] = [0, 1, 2].map(|k| if own.is_empty() { 0.0 } else { mean(&absolute(k)) });
+                    step.near[at] = near_settled;
+                    continue;
+                }
                 let Some((weights, near)) = self.weights(t, x, y, colors, &mut nodes) else { continue };
                 if own.is_empty() {
                     continue;
@@ -218,7 +259,7 @@ impl<'a> Whole<'a> {
                 } else {
                     out.clone()
                 };
-                step.near[at] = near + around.near;
+                step.near[at] = near + around.near + near_settled;
                 step.size[at] = std::array::from_fn(|k| {
                     let greatest = absolute[k].iter().copied().fold(0.0, f64::max);
                     mean(&size.iter().map(|c| c[k]).collect::<Vec<_>>()) + (-80.0_f64).exp() * greatest

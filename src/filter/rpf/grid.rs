@@ -133,6 +133,13 @@ impl Places {
         (at(self.first[0] + column, self.image.width), at(self.first[1] + row, self.image.height))
     }
 
+    /// Whether any pixel that the weights of a node are interpolated for is filtered at all.
+    fn needed(&self, pass: &Pass, x: u32, y: u32) -> bool {
+        let around = Rect::new(x, y, 1, 1).grown(self.spacing - 1, &pass.tile.geometry().window());
+        let mut rows = around.y..around.bottom();
+        pass.settled.is_empty() || rows.any(|y| (around.x..around.right()).any(|x| !pass.settled(x, y)))
+    }
+
     /// Computes the weights of a block of nodes, numbered from the first; `rows` holds the values of each of its rows.
     #[inline(always)]
     pub(crate) fn weigh<S: Simd>(
@@ -152,7 +159,8 @@ impl Places {
             let length = values.len() / nodes.width as usize;
             for (column, node) in (nodes.x..).zip(values.chunks_exact_mut(length)) {
                 let (x, y) = self.of(column, row);
-                if !pass.execution.stopped() && pixels.contains(x, y) && pass.weigh(simd, scratch, x, y) {
+                let here = !pass.execution.stopped() && pixels.contains(x, y) && self.needed(pass, x, y);
+                if here && pass.weigh(simd, scratch, x, y) {
                     let Weights { color, features, confidence } = &scratch.weights;
                     node[..3].copy_from_slice(color);
                     node[3] = *confidence;

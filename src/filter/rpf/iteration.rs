@@ -9,9 +9,9 @@ use super::params::Params;
 use super::relevance::Relevant;
 use super::statistics::{Span, impute, make_safe, normalise};
 use super::weights::{Dependencies, Weights, steepness};
-use super::{grid::Grid, random, spikes};
+use super::{grid::Grid, random, spikes, work::Columns};
 use crate::filter::lanes::{Simd, padded};
-use crate::filter::{Execution, Rect, SampleTile};
+use crate::filter::{Execution, Rect, SampleTile, Work};
 
 /// All that a pass reads.
 pub(crate) struct Pass<'a> {
@@ -25,6 +25,8 @@ pub(crate) struct Pass<'a> {
     pub(crate) offsets: Offsets,
     /// n ln n.
     pub(crate) terms: &'a [f64],
+    /// Of each pixel of the data window whether it is passed through; may be empty.
+    pub(crate) settled: &'a [bool],
     /// Colours after the iteration before: R, G, B of each sample next to each other.
     pub(crate) colors: &'a [f32],
 }
@@ -47,7 +49,7 @@ pub(crate) struct Scratch {
     cluster: Cluster,
     /// The neighbourhood: the first `count` are records of the block, the rest fills up whole lanes.
     rows: Vec<u32>,
-    count: usize,
+    pub(super) count: usize,
     order: ColumnOrder,
     /// Columns of the neighbourhood, `stride` values apart.
     columns: Vec<f32>,
@@ -59,8 +61,10 @@ pub(crate) struct Scratch {
     pub(super) dependencies: Dependencies,
     pub(crate) weights: Weights,
     /// The columns that weigh anything, and their factors.
-    active: Vec<usize>,
+    pub(super) active: Vec<usize>,
     factors: Vec<f32>,
+    /// What was done and left out in core pixels.
+    pub(super) work: Work,
     /// Values that the spike step replaced in core pixels.
     pub(crate) spikes: u64,
 }
@@ -84,6 +88,7 @@ impl Scratch {
             weights: Weights::new(features.len()),
             active: Vec::with_capacity(features.len() + 3),
             factors: Vec::with_capacity(features.len() + 3),
+            work: Work::default(),
             spikes: 0,
             order,
         }
@@ -94,7 +99,7 @@ impl Scratch {
         let (stride, columns, features) = (padded(room.rows), order.columns(), order.features.len());
         let values = stride * size_of::<u32>() + (columns + 3) * stride * size_of::<f32>();
         let small = columns
-            + features * (3 * size_of::<f64>() + size_of::<f32>())
+            + features * (6 * size_of::<f64>() + size_of::<f32>())
             + (features + 3) * (size_of::<usize>() + size_of::<f32>());
         (values + small) as u64
             + Histograms::bytes(columns, stride, bins)
@@ -134,16 +139,35 @@ impl Scratch {
         spans
     }
 
-    /// The normalised columns of the colour channels, scaled, from the radiance.
+    /// The normalised columns of the colour channels, scaled, from the radiance; of a grey scene only the first.
     #[inline(always)]
-    fn normalise_colors<S: Simd>(&mut self, simd: S, spans: &[Span; 3], factors: &[f32; 3]) {
+    fn normalise_colors<S: Simd>(&mut self, simd: S, twins: &[usize; 3], spans: &[Span; 3], factors: &[f32; 3]) {
         let (rows, first) = (padded(self.count), self.order.colors.start * self.stride);
         let places = self.columns[first..].chunks_exact_mut(self.stride);
         for (place, radiance) in places.zip(self.radiance.chunks_exact(self.stride)) {
             place[..rows].copy_from_slice(&radiance[..rows]);
         }
         let (count, first) = (self.count, self.order.colors.start);
-        normalise(simd, &mut self.columns([first, first + 1, first + 2]), count, spans, factors);
+        match twins {
+            [0, 0, 0] => normalise(simd, &mut self.columns([first]), count, &[spans[0]], &[factors[0]]),
+            _ => normalise(simd, &mut self.columns([first, first + 1, first + 2]), count, spans, factors),
+        }
+    }
+
+    /// Columns of the neighbourhood that are not constant there; of equal colours one.
+    pub(super) fn varying(&self, twins: &[usize; 3]) -> Columns {
+        let count = |mut columns: std::ops::Range<usize>| {
+            let varying = columns.by_ref().filter(|&column| !self.constant[column]).count();
+            varying as u64
+        };
+        let ColumnOrder { features, positions, random, colors } = self.order.clone();
+        let own = colors.clone().zip(twins.iter().enumerate()).filter(|(_, (channel, twin))| channel == *twin);
+        Columns {
+            positions: count(positions),
+            random: count(random),
+            features: count(features),
+            colors: own.filter(|(column, _)| !self.constant[*column]).count() as u64,
+        }
     }
 }
 
@@ -151,6 +175,11 @@ impl Scratch {
 const BATCH: usize = 4;
 
 impl Pass<'_> {
+    /// Whether a pixel is passed through.
+    pub(super) fn settled(&self, x: u32, y: u32) -> bool {
+        self.settled.get(self.tile.geometry().window().index(x, y)) == Some(&true)
+    }
+
     /// Takes up the samples around a rectangle of pixels; positions and random parameters if they will be wanted.
     #[inline(always)]
     pub(super) fn load<S: Simd>(&self, simd: S, scratch: &mut Scratch, pixels: &Rect, others: bool) {
@@ -193,6 +222,7 @@ impl Pass<'_> {
         self.gather(simd, scratch, x, y) && {
             let spans = self.load_radiance(simd, scratch);
             self.weigh_gathered(simd, scratch, &spans);
+            self.count_weighing(scratch, &spans, x, y);
             true
         }
     }
@@ -245,7 +275,7 @@ impl Pass<'_> {
                 scratch.constant[column] = span.constant();
             }
         }
-        scratch.normalise_colors(simd, spans, &[1.0; 3]);
+        scratch.normalise_colors(simd, self.relevant.twins(), spans, &[1.0; 3]);
         for (column, span) in colors.zip(spans) {
             scratch.constant[column] = span.constant();
         }
@@ -257,11 +287,11 @@ impl Pass<'_> {
         let Scratch { histograms, columns, constant, order, count, stride, .. } = scratch;
         let ColumnOrder { features, positions, random, colors } = order.clone();
         histograms.start(*count);
-        for part in [features, positions.start..random.end, colors] {
-            for column in part {
-                let values = &columns[column * *stride..][..padded(*count)];
-                histograms.set(simd, column, values, constant[column], self.terms);
-            }
+        let twins = self.relevant.twins().iter().enumerate();
+        let colors = colors.zip(twins).filter(|(_, (channel, twin))| channel == *twin).map(|(column, _)| column);
+        for column in features.chain(positions.start..random.end).chain(colors) {
+            let values = &columns[column * *stride..][..padded(*count)];
+            histograms.set(simd, column, values, constant[column], self.terms);
         }
     }
 
@@ -270,15 +300,20 @@ impl Pass<'_> {
     pub(super) fn measure_dependencies<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
         let Scratch { histograms, dependencies, order, .. } = &mut *scratch;
         let ColumnOrder { features, positions, random, colors } = order.clone();
-        for (channel, column) in colors.enumerate() {
-            dependencies.color_position[channel] =
-                histograms.information(simd, column, &positions, self.terms).iter().sum();
-            dependencies.color_random[channel] = histograms.information(simd, column, &random, self.terms).iter().sum();
-            let on_features = histograms.information(simd, column, &features, self.terms);
-            for (sum, information) in dependencies.color_feature.iter_mut().zip(on_features) {
-                *sum = information + if channel == 0 { 0.0 } else { *sum };
+        for (channel, &twin) in self.relevant.twins().iter().enumerate() {
+            let column = colors.start + twin;
+            if twin == channel {
+                dependencies.color_position[channel] =
+                    histograms.information(simd, column, &positions, self.terms).iter().sum();
+                dependencies.color_random[channel] =
+                    histograms.information(simd, column, &random, self.terms).iter().sum();
+                dependencies.color_features[channel]
+                    .copy_from_slice(histograms.information(simd, column, &features, self.terms));
+            } else {
+                dependencies.copy_color(twin, channel);
             }
         }
+        dependencies.add_colors();
         for (feature, column) in features.enumerate() {
             dependencies.feature_position[feature] =
                 histograms.information(simd, column, &positions, self.terms).iter().sum();
@@ -314,6 +349,7 @@ impl Pass<'_> {
         let interpolated = grid.is_some_and(|grid| grid.interpolate(x, y, &mut scratch.weights));
         if !interpolated {
             self.weigh_gathered(simd, scratch, &spans);
+            self.count_weighing(scratch, &spans, x, y);
         }
         simd.vectorize(
             #[inline(always)]
@@ -323,13 +359,15 @@ impl Pass<'_> {
             #[inline(always)]
             || self.filter_samples(simd, scratch, &spans, out),
         );
+        self.count_filtering(scratch, interpolated, x, y);
     }
 
     /// Step 5, with scaled columns.
     #[inline(always)]
     pub(super) fn filter_samples<S: Simd>(&self, simd: S, scratch: &Scratch, spans: &[Span; 3], out: &mut [f32]) {
         let Scratch { columns, stride, active, radiance, count, .. } = scratch;
-        let distances = Distances { columns, stride: *stride, active, radiance, spans, rows: *count };
+        let distances =
+            Distances { columns, stride: *stride, active, radiance, spans, twins: self.relevant.twins(), rows: *count };
         bilateral::filter(simd, &distances, out);
     }
 
@@ -354,7 +392,9 @@ impl Pass<'_> {
         let Scratch { active, factors, weights, order, .. } = &mut *scratch;
         active.clear();
         factors.clear();
-        let columns = order.features.clone().chain(order.colors.clone());
+        // A colour that equals another counts as that one once more.
+        let colors = self.relevant.twins().map(|twin| order.colors.start + twin);
+        let columns = order.features.clone().chain(colors);
         for (column, &weight) in columns.zip(weights.features.iter().chain(&weights.color)) {
             let factor = factor(weight);
             if counts(factor) {
@@ -374,10 +414,13 @@ impl Pass<'_> {
                 scratch.normalise(simd, [*column], &[*factor]);
             }
             if features < active.len() {
-                scratch.normalise_colors(simd, spans, &scratch.weights.color.map(factor));
+                scratch.normalise_colors(simd, self.relevant.twins(), spans, &scratch.weights.color.map(factor));
             }
         } else {
-            for (&column, factor) in active.iter().zip(&factors) {
+            for (index, (&column, factor)) in active.iter().zip(&factors).enumerate() {
+                if active[..index].contains(&column) {
+                    continue;
+                }
                 let [values] = scratch.columns([column]);
                 values.iter_mut().for_each(|v| *v *= factor);
             }
@@ -408,6 +451,11 @@ impl Pass<'_> {
                 let samples = scratch.block.samples_of(x, y).len();
                 let (out, rest) = row.split_at_mut(3 * samples);
                 row = rest;
+                if self.settled(x, y) {
+                    let samples = self.tile.samples_of(self.tile.geometry().window().index(x, y));
+                    out.copy_from_slice(&self.colors[3 * samples.start..3 * samples.end]);
+                    continue;
+                }
                 self.pixel(simd, scratch, grid, x, y, out);
                 if self.params.spikes {
                     let spikes = spikes::tame(out);

@@ -9,6 +9,8 @@
 //! | 4 weights | `weights.rs`, `grid.rs` |
 //! | 5 filter | `bilateral.rs` |
 //! | 6 spikes | `spikes.rs` |
+//! | what is left out | `relevance.rs`, and what that saves: `work.rs` |
+//! | what is passed through on request | `settled.rs` |
 //! | iterations | `iteration.rs` (one pass), and this file |
 
 mod bilateral;
@@ -21,12 +23,14 @@ mod neighborhood;
 pub mod params;
 mod random;
 mod relevance;
+mod settled;
 mod spikes;
 #[cfg(feature = "bench")]
 #[doc(hidden)]
 pub mod stages;
 mod statistics;
 mod weights;
+pub(crate) mod work;
 
 #[cfg(test)]
 mod tests;
@@ -38,7 +42,7 @@ use super::finish::finish;
 use super::lanes::dispatch;
 use super::plan::{Plan, Shape};
 use super::share::{blocks, blocks_bytes, share_out};
-use super::{Execution, Filtered, Plane, Rect, Report, Role, SampleTile, Stopped, TileGeometry};
+use super::{Execution, Filtered, Plane, Rect, Report, Role, SampleTile, Stopped, TileGeometry, Work};
 use block::ColumnOrder;
 use grid::Grid;
 use iteration::{Pass, Room, Scratch};
@@ -83,13 +87,18 @@ pub(super) fn plan(shape: &Shape, params: &Params) -> Plan {
     // Without a film position the pixel's centre takes its place.
     let order = ColumnOrder::new(features, 2, count(|role| matches!(role, Role::Random { .. })));
     let region = region(shape.geometry, params, shape.varying, 0);
+    let pixels = shape.geometry.window().area();
     let grid = match params.information_grid {
         1 => 0,
         spacing => Grid::bytes(spacing, &region, features),
     };
     let room = room(shape.geometry, params, shape.samples, shape.max_per_pixel, shape.varying);
     Plan {
-        working: shape.samples * 2 * 3 * 4 + grid + (room.rows as u64 + 1) * 8 + blocks_bytes(&region),
+        working: shape.samples * 2 * 3 * 4
+            + grid
+            + (room.rows as u64 + 1) * 8
+            + blocks_bytes(&region)
+            + settled::bytes(params, pixels),
         per_thread: Scratch::bytes(&order, &room, shape.varying, params.bins),
         ..Plan::default()
     }
@@ -147,13 +156,15 @@ fn iterate(
     let terms = information::entropy_terms(room.rows);
     let mut scratches = Vec::with_capacity(execution.threads());
     scratches.resize_with(execution.threads(), || Scratch::new(tile, &relevant, params, &room, execution.leave_out));
+    let settled = settled::settled(tile, params);
     let mut colors = interleaved_colors(tile);
     let mut next = vec![0.0; colors.len()];
     let iterations = params.boxes.len();
     for t in 0..iterations {
         let region = region(tile.geometry(), params, tile.varying(), t);
         let offsets = Offsets::new(params.boxes[t]);
-        let pass = Pass { tile, relevant: &relevant, params, t, execution, offsets, terms: &terms, colors: &colors };
+        let (relevant, terms, settled) = (&relevant, &terms, &settled);
+        let pass = Pass { tile, relevant, params, t, execution, offsets, terms, settled, colors: &colors };
         run(&pass, &region, &mut scratches, &mut next);
         if execution.stopped() {
             return Err(Stopped);
@@ -165,15 +176,23 @@ fn iterate(
         }
     }
     let spikes = scratches.iter().map(|scratch| scratch.spikes).sum();
+    let mut work = Work::default();
+    scratches.iter().for_each(|scratch| work += scratch.work);
     drop((scratches, next));
+    let (core, window) = (tile.geometry().core(), tile.geometry().window());
+    let inside = (core.y..core.bottom()).flat_map(|y| (core.x..core.right()).map(move |x| window.index(x, y)));
+    let settled = inside.filter(|&pixel| settled.get(pixel) == Some(&true) && !tile.samples_of(pixel).is_empty());
     let report = Report {
         replaced: tile.replaced(),
+        settled: settled.clone().count() as u64,
+        settled_error: settled.fold(0.0, |sum, pixel| sum + settled::error(tile, pixel)),
         spikes,
         halo: tile.geometry().halo(),
         halo_needed: tile.geometry().halo_for(params.reach(tile.varying())),
-        left_out: relevant.left_out,
+        work: Some(work),
         ..Report::default()
     };
+    let report = report.leaving_out(relevant.left_out, tile);
     Ok((colors, report))
 }
 

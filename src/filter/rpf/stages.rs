@@ -61,7 +61,8 @@ pub fn with_stages<T>(
     let room = room(tile.geometry(), params, tile.total() as u64, tile.max_per_pixel(), tile.varying());
     let (terms, colors) = (entropy_terms(room.rows), interleaved_colors(tile));
     let offsets = Offsets::new(params.boxes[t]);
-    let pass = Pass { tile, relevant: &relevant, params, t, execution, offsets, terms: &terms, colors: &colors };
+    let pass =
+        Pass { tile, relevant: &relevant, params, t, execution, offsets, terms: &terms, settled: &[], colors: &colors };
     let mut scratch = Scratch::new(tile, &relevant, params, &room, execution.leave_out);
     dispatch!(execution.simd.level(), simd => pass.load(simd, &mut scratch, pixels, true));
     work(&mut Stages { pass: &pass, scratch, spans: Default::default(), out: Vec::new() })

@@ -106,7 +106,7 @@ impl Lab {
     pub fn run(&mut self, case: &Case, preset: &str) -> Result<Outcome, Stopped> {
         let Ok(method) = case.method(preset) else { unreachable!("cases set parameters that there are") };
         let samples = case.samples();
-        let (tile, width) = (samples.whole(), samples.size[0] as usize);
+        let (tile, width) = (case.tile(&samples), samples.size[0] as usize);
         let execution = Execution { seed: SEEDS[0], simd: self.simd, ..Execution::default() };
         let filtered = filter(&tile, &method, &execution)?;
         let whole_image = image(&filtered.rgb);
@@ -243,6 +243,9 @@ impl Back {
             Self::Same | Self::Tiles(_) => {}
             Self::Divided(by) => image.iter_mut().flatten().for_each(|v| *v /= by),
             Self::Mirrored => image.chunks_exact_mut(width).for_each(<[_]>::reverse),
+            Self::Flipped => image = image.chunks_exact(width).rev().flatten().copied().collect(),
+            Self::Transposed => image = (0..image.len()).map(|i| image[i % width * width + i / width]).collect(),
+            Self::Rotated => image.iter_mut().for_each(|pixel| pixel.rotate_left(1)),
         }
         image
     }
