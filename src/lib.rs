@@ -25,7 +25,11 @@ pub mod cli;
 pub mod client;
 #[cfg(feature = "program")]
 pub mod config;
+#[cfg(feature = "program")]
+pub mod disk;
 pub mod filter;
+#[cfg(feature = "program")]
+pub mod image;
 #[cfg(feature = "program")]
 pub mod picture;
 #[cfg(feature = "program")]

@@ -65,7 +65,7 @@ pub(super) fn storage(code: &str, detail: impl std::fmt::Display) -> Problem {
 
 impl From<std::io::Error> for Refusal {
     fn from(error: std::io::Error) -> Self {
-        let full = crate::stitch::canvas::is_full(&error);
+        let full = crate::disk::is_full(&error);
         storage(if full { "disk-full" } else { "io" }, error).into()
     }
 }
