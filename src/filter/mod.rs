@@ -150,6 +150,9 @@ pub enum LeftOutReason {
 }
 
 impl LeftOutReason {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Constant, Self::Missing, Self::Unused];
+
     /// A stable word for reports: `constant`, `missing`, `unused`.
     pub const fn as_str(self) -> &'static str {
         match self {

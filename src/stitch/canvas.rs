@@ -67,7 +67,8 @@ impl CanvasError {
 
 impl From<CanvasError> for io::Error {
     fn from(error: CanvasError) -> Self {
-        Self::other(error)
+        let kind = if let CanvasError::Io { source, .. } = &error { source.kind() } else { io::ErrorKind::Other };
+        Self::new(kind, error)
     }
 }
 

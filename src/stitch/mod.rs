@@ -131,6 +131,11 @@ impl Claim {
     pub const fn core(&self) -> Rect {
         self.core
     }
+
+    /// The digest of its samples.
+    pub const fn digest(&self) -> Digest {
+        self.digest
+    }
 }
 
 /// What became of a delivered core.
@@ -435,6 +440,16 @@ impl Stitcher {
         self.coverage.missing_but(&self.image(), |entry| entry.stored.is_some())
     }
 
+    /// The parts of a rectangle that are not stored.
+    pub fn missing_in(&self, rect: &Rect) -> Vec<Rect> {
+        self.coverage.missing_but(rect, |entry| entry.stored.is_some())
+    }
+
+    /// The digest of the samples of a stored core.
+    pub fn peek(&self, core: &Rect) -> Option<Digest> {
+        Some(self.coverage.get(core)?.stored.as_ref()?.digest)
+    }
+
     /// The stored tiles by rows, with their reports.
     pub fn tiles(&self) -> impl Iterator<Item = (Rect, &Report)> {
         self.coverage.iter().filter_map(|(core, entry)| Some((core, &entry.stored.as_ref()?.report)))
@@ -494,8 +509,7 @@ impl Stitcher {
         Ok(exr::encode(&self.pixels(), &options, out)?)
     }
 
-    /// The options with which the image as it is now would be written. An error while pixels are missing, unless `partial`.
-    pub fn options(&self, options: &ExrOptions, partial: bool) -> Result<ExrOptions, StitchError> {
+    fn options(&self, options: &ExrOptions, partial: bool) -> Result<ExrOptions, StitchError> {
         let mut options = options.clone();
         let missing = self.check_complete(partial)?;
         if missing > 0 {

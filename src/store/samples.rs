@@ -40,12 +40,14 @@ pub struct Extent {
     pub check: [u8; 16],
 }
 
-/// Bytes of disk that the samples of a core take at most.
-pub fn worst_case(pixels: u64, samples: u64, planes: usize, varying: bool) -> u64 {
-    let frame = |bytes: u64| bytes + bytes.div_ceil(4 * BLOCK) * ((4 * BLOCK >> 8) + 64) + 64;
-    let counts = if varying { frame(2 * pixels) + 4 * pixels.div_ceil(BLOCK) } else { 0 };
-    let plane = frame(4 * samples) + 5 + 4 * samples.div_ceil(BLOCK);
-    (5 + counts + plane * planes as u64).next_multiple_of(PAGE)
+/// Bytes of disk that the samples of `cores` cores take at most, which have so many pixels and samples in all.
+pub fn worst_case(cores: u64, pixels: u64, samples: u64, planes: usize, varying: bool) -> u64 {
+    // A frame is at most a 256th longer than what is in it, and a few bytes; its length is in the head.
+    let stored = |bytes: u64, values: u64| bytes + bytes / 256 + (80 + 4) * values.div_ceil(BLOCK);
+    let counts = if varying { stored(2 * pixels, pixels) } else { 0 };
+    // Each core may begin a block and a page.
+    let per_core = PAGE + 5 + (planes as u64 + 1) * (80 + 4 + 5);
+    counts + stored(4 * samples, samples) * planes as u64 + cores * per_core
 }
 
 /// The file.
@@ -95,7 +97,8 @@ impl SampleFile {
         let window = tile.geometry().window();
         let rows = || (core.y..core.bottom()).map(|y| (window.index(core.x, y), window.index(core.right() - 1, y)));
         let samples: u64 = rows().map(|(a, b)| (tile.samples_of(b).end - tile.samples_of(a).start) as u64).sum();
-        let room = worst_case(core.area(), samples, self.channels.planes(), tile.varying());
+        let room = worst_case(1, core.area(), samples, self.channels.planes(), tile.varying());
+        let room = room.next_multiple_of(PAGE);
         let offset = {
             let mut end = self.end.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
             *end += room;
@@ -182,7 +185,11 @@ impl SampleFile {
     /// Memory that [`Self::cut`] takes at most beside the tile itself.
     pub fn cut_bytes(&self, cores: &[(Rect, Extent)]) -> u64 {
         let per_part = 256 + 64 * self.channels.planes() as u64;
-        BUFFERS + cores.iter().map(|(core, extent)| per_part + 3 * u64::from(extent.head) + 8 * u64::from(core.height)).sum::<u64>()
+        BUFFERS
+            + cores
+                .iter()
+                .map(|(core, extent)| per_part + 3 * u64::from(extent.head) + 8 * u64::from(core.height))
+                .sum::<u64>()
     }
 }
 
@@ -271,7 +278,13 @@ struct Blocks {
 
 impl Reader<'_> {
     /// Reads values of `N` bytes from this one on.
-    fn read<const N: usize>(&self, blocks: &Blocks, from: u64, count: u64, mut put: impl FnMut([u8; N])) -> io::Result<()> {
+    fn read<const N: usize>(
+        &self,
+        blocks: &Blocks,
+        from: u64,
+        count: u64,
+        mut put: impl FnMut([u8; N]),
+    ) -> io::Result<()> {
         let invalid = |why: &str| io::Error::new(io::ErrorKind::InvalidData, format!("it is damaged: {why}"));
         let (mut at, end) = (from, from + count);
         if end > blocks.values {
@@ -286,7 +299,8 @@ impl Reader<'_> {
                 cache.block = None;
                 let mut compressed = vec![0; (stop - start) as usize];
                 self.file.read(start, &mut compressed)?;
-                cache.bytes = zstd::bulk::decompress(&compressed, values * N).map_err(|_| invalid("a block of samples"))?;
+                cache.bytes =
+                    zstd::bulk::decompress(&compressed, values * N).map_err(|_| invalid("a block of samples"))?;
                 if cache.bytes.len() != values * N {
                     return Err(invalid("a block of samples has another length"));
                 }

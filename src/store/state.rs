@@ -156,11 +156,7 @@ impl State {
         self.each(SAMPLES, take)
     }
 
-    fn each(
-        &self,
-        table: TableDefinition<Key, &[u8]>,
-        mut take: impl FnMut(Rect, &[u8]),
-    ) -> Result<(), StateError> {
+    fn each(&self, table: TableDefinition<Key, &[u8]>, mut take: impl FnMut(Rect, &[u8])) -> Result<(), StateError> {
         guarded(&self.path, || {
             let table = self.database.begin_read()?.open_table(table)?;
             for entry in table.iter()? {
@@ -187,7 +183,9 @@ fn guarded<T>(path: &std::path::Path, work: impl FnOnce() -> Result<T, redb::Err
     let damaged = |why: String| StateError::Damaged { path: path.to_owned(), why };
     match catch_unwind(AssertUnwindSafe(work)) {
         Ok(Ok(done)) => Ok(done),
-        Ok(Err(redb::Error::Io(error))) if error.kind() == io::ErrorKind::InvalidData => {
+        Ok(Err(redb::Error::Io(error)))
+            if matches!(error.kind(), io::ErrorKind::InvalidData | io::ErrorKind::UnexpectedEof) =>
+        {
             Err(damaged(error.to_string()))
         }
         Ok(Err(redb::Error::Io(error))) => Err(io_error(path, &error)),
@@ -268,7 +266,11 @@ mod tests {
             let mut bytes = whole.clone();
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
             let at = (state >> 20) as usize % whole.len();
-            if case % 4 == 0 { bytes.truncate(at) } else { bytes[at] ^= 1 << (state % 8) }
+            if case % 4 == 0 {
+                bytes.truncate(at)
+            } else {
+                bytes[at] ^= 1 << (state % 8)
+            }
             std::fs::write(&path, &bytes).unwrap();
             match State::open(&folder) {
                 Err(error) => {
