@@ -168,6 +168,8 @@ pub struct Image {
     committer: Mutex<Committer>,
     inner: RwLock<Inner>,
     failed: OnceLock<StateError>,
+    /// Held, many at a time, by those who write pixels or samples; taken before the other locks.
+    writing: RwLock<()>,
     stop: AtomicBool,
 }
 
@@ -283,6 +285,7 @@ impl Image {
             committer: Mutex::new(Committer { state: Some(state), done: 0 }),
             inner: RwLock::new(inner),
             failed: OnceLock::new(),
+            writing: RwLock::new(()),
             stop: AtomicBool::new(false),
         })
     }
@@ -319,6 +322,13 @@ impl Image {
         self.failed().map_or(Ok(()), |error| Err(error.clone().into()))
     }
 
+    /// The right to write to the files. Once the image is closed nobody has it: they may be another one's by then.
+    fn writer(&self) -> Result<RwLockReadGuard<'_, ()>, ImageError> {
+        let writer = self.writing.read().unwrap_or_else(PoisonError::into_inner);
+        self.check()?;
+        Ok(writer)
+    }
+
     /// Stops the work on it: it is being forgotten, or the service ends.
     pub fn stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
@@ -351,7 +361,7 @@ impl Image {
 
     /// Puts a filtered tile on the canvas, and says what became of it. That holds once [`Self::flush`] has said so.
     pub fn add(&self, mut claimed: Claimed, filtered: &Filtered, seconds: f64) -> Result<Added, ImageError> {
-        self.check()?;
+        let _writer = self.writer()?;
         let Some(claim) = claimed.claim.take() else { return Err(StitchError::Mismatch(filtered.core).into()) };
         let mut inner = self.write();
         if inner.finished && inner.neighbors.is_none() {
@@ -480,12 +490,15 @@ impl Image {
         committer.state = None;
     }
 
-    /// Closes the store, so that the image can be opened anew; whoever still has this one gets errors.
+    /// Closes the files, so that the image can be opened anew; whoever still has this one gets errors. Waits for those
+    /// who are just writing.
     pub fn close(&self) {
         let mut committer = self.committer();
         if committer.state.is_some() {
             self.fail(&mut committer, &io::Error::other("the image was closed"));
         }
+        drop(committer);
+        drop(self.writing.write().unwrap_or_else(PoisonError::into_inner));
     }
 
     /// Refuses if a stored tile's pixels are not those that were stored. `stop` ends it early.

@@ -291,6 +291,7 @@ impl Image {
             inner.neighbors.as_ref().map(Neighbors::file)
         };
         let Some(file) = file else { return Ok(Outcome::Repeated) };
+        let _writer = self.writer()?;
         let extent = file.append(tile)?;
         let mut inner = self.write();
         // Another one may have brought it meanwhile.
@@ -313,6 +314,7 @@ impl Image {
 
     /// The next region that can be filtered, in tiles that take at most `most` bytes each.
     pub fn next_job(&self, threads: usize, most: u64) -> Result<Option<Job>, ImageError> {
+        self.check()?;
         let mut inner = self.write();
         let inner = &mut *inner;
         let (Some(neighbors), Some(announced)) = (&mut inner.neighbors, &self.description.neighbors) else {
