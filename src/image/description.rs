@@ -2,7 +2,11 @@
 
 use serde_json::{Map, Value, json};
 
-use crate::filter::{Channel, ChannelSet, Method, Role, geometry::MAX_SIDE};
+use super::{MAX_TILES, MIN_CORE};
+use crate::{
+    filter::{Channel, ChannelSet, Method, Role, geometry::MAX_SIDE},
+    store::{samples, state},
+};
 
 /// What an image is to be.
 #[derive(Clone, Debug, PartialEq)]
@@ -87,6 +91,28 @@ impl Description {
             neighbors,
             disk: value["disk"].as_u64()?,
         })
+    }
+}
+
+/// Bytes of disk that such an image takes at most: pixels, result, a tile on its way, records, samples.
+pub fn disk_bytes(description: &Description) -> u64 {
+    let [width, height] = description.size.map(u64::from);
+    let pixels = width * height;
+    let (base, record) = state::STATE_BYTES;
+    let most = |tiles: u64| tiles.min(MAX_TILES as u64);
+    // An EXR does not compress at worst, and has a table and attributes.
+    let result = pixels * 12 + pixels / 64 + (1 << 20);
+    match &description.neighbors {
+        None => pixels * 24 + result + base + most(pixels) * record,
+        Some(known) => {
+            let least = u64::from(MIN_CORE);
+            let cores = most((width / least + 2) * (height / least + 2));
+            let region = u64::from(known.region);
+            let regions = most(width.div_ceil(region) * height.div_ceil(region));
+            let samples = pixels * u64::from(known.samples);
+            let samples = samples::worst_case(cores, pixels, samples, known.channels.planes(), known.varying);
+            pixels * 12 + result + base + (cores + 4 * regions) * record + samples
+        }
     }
 }
 

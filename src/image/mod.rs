@@ -11,11 +11,14 @@
 //! Pixels are never written over in place: a tile that replaces another is written beside the canvas first.
 
 pub mod description;
+mod error;
+mod inner;
 mod neighbors;
 mod record;
 pub mod regions;
 
-pub use description::{Announced, Description};
+pub use description::{Announced, Description, disk_bytes};
+pub use error::ImageError;
 pub use neighbors::{Job, keeping};
 pub use regions::{RegionState, Regions};
 
@@ -32,12 +35,12 @@ use std::{
 
 use crate::{
     disk::Folder,
-    filter::{ChannelSet, Filtered, Rect, SampleTile, Stopped, samples::Replaced},
+    filter::{ChannelSet, Filtered, Rect, SampleTile, Stopped},
     stitch::{
-        Added, Canvas, CanvasError, Claim, Digest, ExrOptions, Offer, Pixels, StitchError, Stitcher, Verdict,
-        canvas::Checksum, digest::digest,
+        Added, Canvas, CanvasError, Claim, ExrOptions, Offer, Pixels, StitchError, Stitcher, Verdict, canvas::Checksum,
+        digest::digest,
     },
-    store::{Change, SpoolError, State, StateError, samples, state},
+    store::{Change, State, StateError, samples, state},
 };
 use description::{channels_from_json, channels_to_json};
 use neighbors::Neighbors;
@@ -57,73 +60,6 @@ const RESULT: &str = "result.exr";
 pub const FILES: [&str; 6] = [state::STATE_FILE, samples::SAMPLES_FILE, CANVAS, REPLACEMENT, RESULT, TOUCHED];
 /// Its age is the time since the image was last used.
 pub const TOUCHED: &str = "touched";
-
-/// Why an image cannot do something.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum ImageError {
-    /// The stitcher refuses.
-    #[error(transparent)]
-    Stitch(#[from] StitchError),
-    /// The store fails.
-    #[error(transparent)]
-    State(#[from] StateError),
-    /// The samples make no tile.
-    #[error(transparent)]
-    Samples(SpoolError),
-    /// A file cannot be made or written.
-    #[error(transparent)]
-    Io(#[from] io::Error),
-    /// It takes no more tiles.
-    #[error("the image was finished: it takes no more tiles")]
-    Finished,
-    /// It has as many tiles as it may have.
-    #[error("an image has {MAX_TILES} tiles at most: send larger ones")]
-    TooManyTiles,
-    /// A bare core that is too small.
-    #[error(
-        "tile {0} is too small: cores must have {MIN_CORE} x {MIN_CORE} pixels at least, fewer only at the image's edge"
-    )]
-    TooSmall(Rect),
-    /// Numbers of samples that were not announced.
-    #[error("tile {core} has {got} samples per pixel: the image was opened with {announced}")]
-    SampleCount {
-        /// The core.
-        core: Rect,
-        /// What it has, in words.
-        got: String,
-        /// What was announced, in words.
-        announced: String,
-    },
-    /// A region that cannot be filtered within the memory there is.
-    #[error("a single pixel of tile {core} needs {needed} bytes of memory with its halo, and {most} is all there is")]
-    TooLarge {
-        /// The pixel.
-        core: Rect,
-        /// Bytes needed.
-        needed: u64,
-        /// Bytes there are.
-        most: u64,
-    },
-    /// The work was stopped.
-    #[error(transparent)]
-    Stopped(#[from] Stopped),
-}
-
-impl From<SpoolError> for ImageError {
-    fn from(error: SpoolError) -> Self {
-        match error {
-            SpoolError::Io(error) => Self::Io(error),
-            error => Self::Samples(error),
-        }
-    }
-}
-
-impl From<CanvasError> for ImageError {
-    fn from(error: CanvasError) -> Self {
-        Self::Stitch(error.into())
-    }
-}
 
 /// What becomes of a tile that was offered.
 #[derive(Debug)]
@@ -545,123 +481,4 @@ impl Image {
 
 fn key(options: &ExrOptions) -> String {
     format!("{options:?}")
-}
-
-impl Inner {
-    fn queue(&mut self, changes: impl IntoIterator<Item = Change>, after: Option<After>) {
-        self.changes.extend(changes);
-        self.after.extend(after);
-        self.queued += 1;
-    }
-
-    fn offer(&mut self, core: Rect, digest: Digest, replace: bool) -> Result<Offer, ImageError> {
-        if self.finished && self.neighbors.is_none() {
-            return match self.stitcher.peek(&core) {
-                Some(known) if known == digest => Ok(Offer::Repeated),
-                _ => Err(ImageError::Finished),
-            };
-        }
-        if self.stitcher.known() >= MAX_TILES {
-            return Err(ImageError::TooManyTiles);
-        }
-        Ok(self.stitcher.offer(core, digest, replace)?)
-    }
-
-    fn record(&self, digest: Digest, checksum: Checksum, filtered: &Filtered, seconds: f64) -> Change {
-        let record = TileRecord { digest, checksum, seconds, report: filtered.report.clone() };
-        Change::Tile(filtered.core, self.channels.as_ref().map_or_else(Vec::new, |channels| record.encode(channels)))
-    }
-
-    fn committed(&mut self, after: After) {
-        let Some(neighbors) = &mut self.neighbors else { return };
-        match after {
-            After::Arrived(core) => neighbors.arrived(&core),
-            After::RegionDone(region) => neighbors.done(region),
-            After::Finished => neighbors.finish(),
-        }
-    }
-
-    fn forget_result(&mut self, folder: &dyn Folder) {
-        if self.result.take().is_some() {
-            let _ = folder.remove(RESULT);
-        }
-    }
-
-    /// The pixels, and what is known of them.
-    pub const fn stitcher(&self) -> &Stitcher {
-        &self.stitcher
-    }
-
-    /// Time that filtering a stored tile took.
-    pub fn seconds(&self, core: &Rect) -> f64 {
-        self.notes.get(core).map_or(0.0, |note| note.seconds)
-    }
-
-    /// The channels of its tiles: as announced, or those of the first that came whole.
-    pub const fn channels(&self) -> Option<&ChannelSet> {
-        self.channels.as_ref()
-    }
-
-    /// Whether it takes no more tiles.
-    pub const fn finished(&self) -> bool {
-        self.finished
-    }
-
-    /// Whether nothing more will come, and all that can be filtered is.
-    pub fn settled(&self) -> bool {
-        let waiting = self.neighbors.as_ref().map_or(0, |neighbors| neighbors.regions().open());
-        self.stitcher.is_complete() || self.finished && waiting == 0
-    }
-
-    /// How often a tile took the place of another since it was opened.
-    pub const fn replacements(&self) -> u64 {
-        self.replacements
-    }
-
-    /// Whether it does not have to be kept in memory.
-    pub fn idle(&self) -> bool {
-        self.changes.is_empty() && self.neighbors.as_ref().is_none_or(Neighbors::idle)
-    }
-
-    /// The regions, if its tiles come as bare cores.
-    pub fn regions(&self) -> Option<&Regions> {
-        self.neighbors.as_ref().map(Neighbors::regions)
-    }
-
-    /// Cores that have arrived as bare ones, and their pixels.
-    pub fn arrived(&self) -> (usize, u64) {
-        self.neighbors.as_ref().map_or((0, 0), Neighbors::count)
-    }
-
-    /// The parts of a window that no bare core has brought.
-    pub fn absent(&self, window: &Rect) -> Vec<Rect> {
-        self.neighbors.as_ref().map_or_else(Vec::new, |neighbors| neighbors.absent(window))
-    }
-
-    /// Values that were replaced in bare cores. The regions' own reports know nothing of them.
-    pub fn replaced(&self) -> Replaced {
-        self.neighbors.as_ref().map_or_else(Replaced::default, Neighbors::replaced)
-    }
-}
-
-/// Bytes of disk that such an image takes at most: pixels, result, a tile on its way, records, samples.
-pub fn disk_bytes(description: &Description) -> u64 {
-    let [width, height] = description.size.map(u64::from);
-    let pixels = width * height;
-    let (base, record) = state::STATE_BYTES;
-    let most = |tiles: u64| tiles.min(MAX_TILES as u64);
-    // An EXR does not compress at worst, and has a table and attributes.
-    let result = pixels * 12 + pixels / 64 + (1 << 20);
-    match &description.neighbors {
-        None => pixels * 24 + result + base + most(pixels) * record,
-        Some(known) => {
-            let least = u64::from(MIN_CORE);
-            let cores = most((width / least + 2) * (height / least + 2));
-            let region = u64::from(known.region);
-            let regions = most(width.div_ceil(region) * height.div_ceil(region));
-            let samples = pixels * u64::from(known.samples);
-            let samples = samples::worst_case(cores, pixels, samples, known.channels.planes(), known.varying);
-            pixels * 12 + result + base + (cores + 4 * regions) * record + samples
-        }
-    }
 }

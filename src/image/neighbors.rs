@@ -1,7 +1,6 @@
 //! Images whose tiles come as bare cores: the samples are kept until all regions that read them are filtered.
 
 use std::{
-    io,
     sync::{Arc, atomic::Ordering},
     time::Instant,
 };
@@ -419,27 +418,5 @@ fn halves(rect: Rect) -> [Rect; 2] {
     } else {
         let top = height / 2;
         [Rect::new(x, y, width, top), Rect::new(x, y + top, width, height - top)]
-    }
-}
-
-impl ImageError {
-    /// Whether bytes on the disk are not what was written.
-    pub fn is_damage(&self) -> bool {
-        match self {
-            Self::Stitch(error) => error.code() == "damaged",
-            Self::State(error) => error.code() == "damaged",
-            Self::Io(error) => error.kind() == io::ErrorKind::InvalidData,
-            _ => false,
-        }
-    }
-
-    /// Whether the disk has no space left.
-    pub fn is_full(&self) -> bool {
-        match self {
-            Self::Stitch(error) => error.code() == "disk-full",
-            Self::State(error) => error.code() == "disk-full",
-            Self::Io(error) => crate::disk::is_full(error),
-            _ => false,
-        }
     }
 }

@@ -8,6 +8,7 @@
 
 mod body;
 mod images;
+mod opened;
 mod picture;
 mod problem;
 mod query;
