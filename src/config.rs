@@ -76,6 +76,10 @@ pub const MAX_MEMORY: u64 = (1 << 42) - 1024;
 pub const MAX_THREADS: usize = 1024;
 /// Most pixels of an image: the greatest width and height there are.
 pub const MAX_IMAGE_PIXELS: u64 = 1 << 40;
+/// Most disk: 1 EiB.
+pub const MAX_DISK: u64 = 1 << 60;
+/// Longest time that images are kept: ten years.
+pub const MAX_TTL: Duration = Duration::from_secs(10 * 365 * 86_400);
 /// Longest deadline: a day.
 pub const MAX_DEADLINE: Duration = Duration::from_secs(86_400);
 
@@ -90,7 +94,7 @@ pub struct Config {
     pub threads: usize,
     /// SIMD instructions that they filter with.
     pub simd: SimdLevel,
-    /// Folder for canvases and for results that nobody has read yet; made if it is not there.
+    /// Folder for images, and for results that nobody has read yet; made if it is not there. One service at a time.
     pub data_dir: PathBuf,
     /// How long a tile may wait for memory before it is refused.
     pub queue_deadline: Duration,
@@ -104,13 +108,18 @@ pub struct Config {
     pub connections: usize,
     /// Images open at once. 1 to 65536.
     pub images: usize,
+    /// Bytes of disk that all images may take; what one takes at worst is set aside when it is opened. 1 MiB to 1 EiB.
+    pub disk: ByteSize,
+    /// How long an image is kept that nobody uses: a second to ten years.
+    pub image_ttl: Duration,
     /// Pixels of an image at most; its canvas takes 12 bytes of disk for each. 1 to [`MAX_IMAGE_PIXELS`].
     pub image_pixels: u64,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        let data_dir = std::env::var_os("TMPDIR").map_or_else(|| PathBuf::from("/var/tmp"), PathBuf::from);
+        let temporary = std::env::var_os("TMPDIR").map_or_else(|| PathBuf::from("/var/tmp"), PathBuf::from);
+        let data_dir = temporary.join("rpfd");
         Self {
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)),
             memory: ByteSize(1 << 30),
@@ -123,6 +132,8 @@ impl Default for Config {
             shutdown_deadline: Duration::from_secs(20),
             connections: 1024,
             images: 1024,
+            disk: ByteSize(64 << 30),
+            image_ttl: Duration::from_secs(7 * 86_400),
             image_pixels: 1 << 30,
         }
     }
@@ -158,6 +169,11 @@ impl Config {
         for (name, count) in [("connections", self.connections), ("images", self.images)] {
             rule((1..=65536).contains(&count), name, &count, "must be 1 to 65536");
         }
+        let disk = (MIN_MEMORY..=MAX_DISK).contains(&self.disk.0);
+        rule(disk, "disk", &self.disk, "must be 1MiB to 1EiB");
+        let ttl = (Duration::from_secs(1)..=MAX_TTL).contains(&self.image_ttl);
+        let seconds = format_args!("{}s", self.image_ttl.as_secs_f64()).to_string();
+        rule(ttl, "image_ttl", &seconds, "must be a second to ten years");
         let pixels = (1..=MAX_IMAGE_PIXELS).contains(&self.image_pixels);
         rule(pixels, "image_pixels", &self.image_pixels, "must be 1 to 2^40");
         if wrong.is_empty() { Ok(()) } else { Err(ConfigError(wrong)) }
@@ -208,10 +224,12 @@ mod tests {
             shutdown_deadline: Duration::ZERO,
             connections: 0,
             images: 0,
+            disk: ByteSize(0),
+            image_ttl: Duration::ZERO,
             image_pixels: 0,
             ..Config::default()
         };
-        assert_eq!(zero.validate().unwrap_err().0.len(), 10);
+        assert_eq!(zero.validate().unwrap_err().0.len(), 12);
     }
 
     #[test]
@@ -226,6 +244,9 @@ mod tests {
         assert!(with(&|c| c.memory.0 = MAX_MEMORY) && !with(&|c| c.memory.0 = MAX_MEMORY + 1));
         assert!(with(&|c| c.threads = MAX_THREADS) && !with(&|c| c.threads = MAX_THREADS + 1));
         assert!(with(&|c| c.idle_deadline = MAX_DEADLINE) && !with(&|c| c.idle_deadline = MAX_DEADLINE + second));
+        assert!(with(&|c| c.disk.0 = MAX_DISK) && !with(&|c| c.disk.0 = MAX_DISK + 1));
+        assert!(with(&|c| c.image_ttl = second) && !with(&|c| c.image_ttl = second / 2));
+        assert!(with(&|c| c.image_ttl = MAX_TTL) && !with(&|c| c.image_ttl = MAX_TTL + second));
         assert!(with(&|c| c.connections = 65536) && !with(&|c| c.connections = 65537));
         assert!(with(&|c| c.image_pixels = MAX_IMAGE_PIXELS) && !with(&|c| c.image_pixels = MAX_IMAGE_PIXELS + 1));
         assert!(with(&|c| c.images = 1) && !with(&|c| c.images = 65537));

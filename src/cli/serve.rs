@@ -32,9 +32,15 @@ pub(crate) struct Args {
     threads: Option<usize>,
     #[command(flatten)]
     simd: SimdArgs,
-    /// Folder for canvases and unread results; made if missing [default: $TMPDIR or /var/tmp]
+    /// Folder for images and unread results, of this service alone; made if missing [default: rpfd in $TMPDIR or /var/tmp]
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
+    /// Disk for all images, like 64GiB [default: 64GiB]
+    #[arg(long, value_name = "SIZE")]
+    disk: Option<ByteSize>,
+    /// Seconds after which an image that nobody uses is forgotten [default: 604800, a week]
+    #[arg(long, value_name = "SECONDS")]
+    image_ttl: Option<f64>,
     /// Seconds that a tile may wait for memory before it is refused [default: 60]
     #[arg(long, value_name = "SECONDS")]
     queue_deadline: Option<f64>,
@@ -60,6 +66,8 @@ impl Args {
             threads: self.threads.unwrap_or(default.threads),
             simd: self.simd.level,
             data_dir: self.data_dir.unwrap_or(default.data_dir),
+            disk: self.disk.unwrap_or(default.disk),
+            image_ttl: seconds(self.image_ttl, default.image_ttl)?,
             queue_deadline: seconds(self.queue_deadline, default.queue_deadline)?,
             idle_deadline: seconds(self.idle_deadline, default.idle_deadline)?,
             header_deadline: seconds(self.header_deadline, default.header_deadline)?,

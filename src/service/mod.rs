@@ -8,10 +8,13 @@
 
 mod body;
 mod images;
+mod opened;
 mod picture;
 mod problem;
 mod query;
 mod receive;
+mod regions;
+mod registry;
 mod results;
 mod routes;
 mod stream;
@@ -41,8 +44,11 @@ use crate::{
     admission::Budget,
     config::{Config, ConfigError},
 };
-use images::Images;
+use registry::{Images, StartError};
 use work::Work;
+
+/// How often images that nobody uses are looked for.
+const TIDY: Duration = Duration::from_secs(30);
 
 /// The service could not start or go on.
 #[derive(Debug, thiserror::Error)]
@@ -67,6 +73,12 @@ pub enum ServeError {
         /// Why not.
         source: io::Error,
     },
+    /// Another service uses the data folder.
+    #[error("the data folder {} is in use by another service", path.display())]
+    InUse {
+        /// The folder.
+        path: PathBuf,
+    },
     /// The threads cannot be started.
     #[error("cannot start the filter's threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
@@ -79,6 +91,7 @@ impl ServeError {
             Self::Config(_) => "bad_config",
             Self::Listen { .. } => "listen",
             Self::DataDir { .. } => "data_dir",
+            Self::InUse { .. } => "data_dir_in_use",
             Self::Threads(_) => "threads",
         }
     }
@@ -115,7 +128,11 @@ impl Service {
         let listener = TcpListener::bind(config.listen).map_err(listen)?;
         listener.set_nonblocking(true).map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
-        let (budget, images) = (Budget::new(config.memory.0), Images::new(config.images));
+        let images = Images::start(&config).map_err(|error| match error {
+            StartError::InUse => ServeError::InUse { path: config.data_dir.clone() },
+            StartError::Io(source) => data_dir(source),
+        })?;
+        let budget = Budget::new(config.memory.0);
         let inner = Arc::new(Inner { config, budget, work, images, draining: AtomicBool::new(false) });
         Ok(Self { listener, address, inner })
     }
@@ -135,6 +152,8 @@ impl Service {
         let (stop, stopping) = watch::channel(false);
         let mut connections = JoinSet::new();
         let mut shutdown = pin!(shutdown);
+        inner.images.resume(&inner);
+        let tidying = tokio::spawn(tidy(Arc::clone(&inner)));
         tracing::info!(%address, memory = %inner.config.memory, threads = inner.config.threads, simd = inner.config.simd.name(), "listening");
         loop {
             let room = connections.len() < inner.config.connections;
@@ -162,7 +181,20 @@ impl Service {
         if timeout(inner.config.shutdown_deadline, all).await.is_err() {
             tracing::warn!(connections = connections.len(), "the deadline has passed; requests are cut off");
         }
+        // What is not filtered yet goes on at the next start.
+        tidying.abort();
+        inner.images.stop();
         Ok(())
+    }
+}
+
+/// Sees to images that nobody uses, now and then.
+async fn tidy(inner: Shared) {
+    let mut interval = tokio::time::interval(TIDY.min(inner.config.image_ttl / 4));
+    loop {
+        interval.tick().await;
+        let inner = Arc::clone(&inner);
+        let _ = work::blocking(move || inner.images.tidy()).await;
     }
 }
 

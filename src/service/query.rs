@@ -27,7 +27,7 @@ fn bad_parameter(name: &str, value: &str, right: &str) -> Refusal {
 
 /// The parameters of a request by name, taken out one by one; what is left at the end is unknown.
 #[derive(Debug)]
-pub(super) struct Parameters(BTreeMap<String, String>);
+pub(super) struct Parameters(BTreeMap<String, String>, Option<Value>);
 
 impl Parameters {
     /// Of a query. A name may occur once.
@@ -41,17 +41,18 @@ impl Parameters {
             }
             all.insert(name, value);
         }
-        Ok(Self(all))
+        Ok(Self(all, None))
     }
 
-    /// Of a JSON object: numbers, texts, bools, and lists of these.
+    /// Of a JSON object: numbers, texts, bools, and lists of these. Its `channels` may be anything.
     pub(super) fn of_json(body: &[u8]) -> Result<Self, Refusal> {
         let value: Value = serde_json::from_slice(body)
             .map_err(|error| refuse("bad_json", format!("the body is not the JSON that it should be: {error}")))?;
-        let Value::Object(object) = value else {
+        let Value::Object(mut object) = value else {
             return Err(refuse("bad_json", "the body must be a JSON object".to_owned()));
         };
         let mut all = BTreeMap::new();
+        let channels = object.remove("channels");
         for (name, value) in object {
             let Some(words) = words(&value, true) else {
                 let right = "must be a number, a text, true or false, or a list of them";
@@ -59,7 +60,12 @@ impl Parameters {
             };
             all.insert(name, words);
         }
-        Ok(Self(all))
+        Ok(Self(all, channels))
+    }
+
+    /// Takes out the channels.
+    pub(super) fn channels(&mut self) -> Option<Value> {
+        self.1.take()
     }
 
     /// Takes out a parameter.
@@ -96,8 +102,17 @@ impl Parameters {
         Ok(self.choice("leave_out", &choices)?.unwrap_or(true))
     }
 
+    /// Takes out whether tiles lend each other their halos; absent means no.
+    pub(super) fn neighbors(&mut self) -> Result<bool, Refusal> {
+        Ok(self.choice("halo", &[("client", false), ("neighbors", true)])?.unwrap_or(false))
+    }
+
     /// Takes out everything that is left: preset, seed, and the preset's parameters.
     pub(super) fn method(mut self) -> Result<(Method, u64), Refusal> {
+        if self.1.is_some() {
+            let right = "only images with \"halo\": \"neighbors\" are told of channels";
+            return Err(refuse("bad_parameter", format!("channels: {right}")));
+        }
         let preset = self.take("preset").unwrap_or_else(|| DEFAULT_PRESET.to_owned());
         let seed = self.number("seed")?.unwrap_or(0);
         Ok((Method::with(&preset, self.0)?, seed))

@@ -7,9 +7,9 @@ use super::{body::Frames, problem::Refusal, stream::Call};
 use crate::{
     admission::{AdmissionError, Budget, Permit},
     filter::{
-        Method, Rect, TileGeometry,
+        Rect, TileGeometry,
         geometry::MAX_SIDE,
-        plan::{Plan, Shape, plan},
+        plan::{Plan, Shape},
     },
     wire::{Assembler, Decoder, Event, Header, value::CountReader},
 };
@@ -55,15 +55,15 @@ struct Open {
 }
 
 impl Open {
-    fn push(&mut self, event: &Event, method: &Method, threads: usize) {
+    fn push(&mut self, event: &Event, call: &Call) {
         match event {
             Event::Counts(bytes) => self.counts.push(bytes, |count| self.most = self.most.max(count)),
             // Now the counts are known: what was reserved for the worst of them is more than is needed.
             _ if self.counting => {
                 let shape = self.received.assembler.header().shape();
                 let shape = Shape { max_per_pixel: self.most.into(), ..shape };
-                self.received.plan = plan(&shape, method);
-                self.received.permit.shrink_to(self.received.plan.total(threads));
+                self.received.plan = call.plan(&shape);
+                self.received.permit.shrink_to(self.received.plan.total(call.service.config.threads));
                 self.counting = false;
             }
             _ => {}
@@ -131,7 +131,7 @@ impl Receiver {
                 Ok(Some(Event::TileEnd)) => Some(Step::End),
                 Ok(Some(event)) => {
                     if let Some(open) = open {
-                        open.push(&event, &call.method, call.service.config.threads);
+                        open.push(&event, call);
                     }
                     None
                 }
@@ -166,10 +166,10 @@ enum Step {
 async fn admit(call: &Call, header: Header) -> Result<Open, Refusal> {
     call.check(&header)?;
     let (threads, budget) = (call.service.config.threads, &call.service.budget);
-    let plan = plan(&header.shape(), &call.method);
+    let plan = call.plan(&header.shape());
     let needed = plan.total(threads);
     if let Err(error) = budget.check(needed) {
-        return Err(too_large(error, &header, &call.method, threads, budget));
+        return Err(too_large(error, &header, call, threads, budget));
     }
     // What this request's own tiles hold will be free again: that is no queue.
     let permit = budget.reserve_after(needed, call.idle(), call.service.config.queue_deadline).await?;
@@ -178,9 +178,9 @@ async fn admit(call: &Call, header: Header) -> Result<Open, Refusal> {
 }
 
 /// The answer to a tile that never fits, with the size that would.
-fn too_large(error: AdmissionError, header: &Header, method: &Method, threads: usize, budget: &Budget) -> Refusal {
+fn too_large(error: AdmissionError, header: &Header, call: &Call, threads: usize, budget: &Budget) -> Refusal {
     let mut refusal = Refusal::from(error);
-    let fits = largest_core(header, method, threads, budget);
+    let fits = largest_core(header, call, threads, budget);
     let advice = match fits {
         Some(side) => format!("a core of {side} x {side} pixels with this halo and as many samples would fit"),
         None => "not even a single pixel with this halo and as many samples would fit".to_owned(),
@@ -191,7 +191,7 @@ fn too_large(error: AdmissionError, header: &Header, method: &Method, threads: u
 }
 
 /// Side of the largest square core that fits into the budget, other things being equal.
-fn largest_core(header: &Header, method: &Method, threads: usize, budget: &Budget) -> Option<u32> {
+fn largest_core(header: &Header, call: &Call, threads: usize, budget: &Budget) -> Option<u32> {
     let (halo, window) = (header.geometry().halo(), header.geometry().window());
     let per_pixel = header.total().div_ceil(window.area());
     let fits = |side: u32| {
@@ -199,7 +199,7 @@ fn largest_core(header: &Header, method: &Method, threads: usize, budget: &Budge
         TileGeometry::new([MAX_SIDE, MAX_SIDE], core, halo).is_ok_and(|geometry| {
             let samples = per_pixel * geometry.window().area();
             let shape = Shape { geometry: &geometry, samples, ..header.shape() };
-            budget.check(plan(&shape, method).total(threads)).is_ok()
+            budget.check(call.plan(&shape).total(threads)).is_ok()
         })
     };
     // The need grows with the side.

@@ -19,6 +19,7 @@ pub(super) fn router(service: Shared) -> Router {
         .route("/v1/filter", post(stream::filter_stream).put(stream::filter_stream))
         .route("/v1/images", post(images::open).get(images::list))
         .route("/v1/images/{id}", get(images::status).delete(images::delete))
+        .route("/v1/images/{id}/finish", post(images::finish))
         .route("/v1/images/{id}/tiles", post(stream::image_tiles).put(stream::image_tiles))
         .route("/v1/images/{id}/result.exr", get(images::result))
         .route("/v1/images/{id}/preview.png", get(images::preview))

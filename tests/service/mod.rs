@@ -4,9 +4,11 @@ mod bad_input;
 mod clients;
 mod codes;
 mod curl;
-mod exact;
+mod durable;
+pub(crate) mod exact;
 mod images;
 mod limits;
+pub(crate) mod neighbors;
 
 use std::{
     io::{BufRead, BufReader, Read, Write},
@@ -27,13 +29,23 @@ use serde_json::Value;
 pub(crate) struct Server {
     child: Child,
     pub(crate) address: String,
-    folder: tempfile::TempDir,
+    folder: Option<tempfile::TempDir>,
 }
 
 impl Server {
     pub(crate) fn start(arguments: &[&str]) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let mut child = Command::new(env!("CARGO_BIN_EXE_rpfd"))
+        Self::start_in(tempfile::tempdir().unwrap(), arguments)
+    }
+
+    /// One that finds what was in its data folder before.
+    pub(crate) fn start_in(folder: tempfile::TempDir, arguments: &[&str]) -> Self {
+        let command = Command::new(env!("CARGO_BIN_EXE_rpfd"));
+        Self::start_by(command, folder, arguments)
+    }
+
+    /// One that is started by another program, whose arguments it follows.
+    pub(crate) fn start_by(mut command: Command, folder: tempfile::TempDir, arguments: &[&str]) -> Self {
+        let mut child = command
             .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
             .arg(folder.path())
             .args(arguments)
@@ -45,11 +57,22 @@ impl Server {
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
         let address = line.trim().rsplit("//").next().unwrap().to_owned();
         assert!(!address.is_empty(), "the service did not start");
-        Self { child, address, folder }
+        Self { child, address, folder: Some(folder) }
     }
 
     pub(crate) fn data_dir(&self) -> &Path {
-        self.folder.path()
+        self.folder.as_ref().unwrap().path()
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Kills it at once, and gives what it has left.
+    pub(crate) fn kill(mut self) -> tempfile::TempDir {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+        self.folder.take().unwrap()
     }
 
     pub(crate) fn connect(&self) -> TcpStream {
@@ -79,10 +102,15 @@ impl Server {
     }
 
     /// Tells it to stop, and says how it ended.
-    pub(crate) fn terminate(mut self) -> std::process::ExitStatus {
+    pub(crate) fn terminate(self) -> std::process::ExitStatus {
+        self.terminated().0
+    }
+
+    /// The same, and gives what it has left.
+    pub(crate) fn terminated(mut self) -> (std::process::ExitStatus, tempfile::TempDir) {
         let id = self.child.id().to_string();
         assert!(Command::new("kill").args(["-TERM", &id]).status().unwrap().success());
-        self.child.wait().unwrap()
+        (self.child.wait().unwrap(), self.folder.take().unwrap())
     }
 }
 
@@ -195,6 +223,17 @@ pub(crate) fn encode(tile: &SampleTile) -> Vec<u8> {
 
 pub(crate) fn tile(image: [u32; 2], core: Rect, halo: u32) -> Vec<u8> {
     encode(&samples(image, core, halo, 1))
+}
+
+/// Waits until a question is answered with yes; long enough for the slowest machine.
+pub(crate) fn wait_for(what: &str, mut done: impl FnMut() -> bool) {
+    for _ in 0..1200 {
+        if done() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    panic!("waited in vain for {what}");
 }
 
 /// A small image as one tile.
