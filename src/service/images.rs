@@ -273,6 +273,11 @@ impl Images {
         work(&mut self.all.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
+    /// How many there are.
+    pub(super) fn count(&self) -> usize {
+        self.with(|all| all.len())
+    }
+
     pub(super) fn find(&self, id: &Id) -> Result<Arc<Image>, Refusal> {
         self.with(|all| all.get(id).cloned()).ok_or_else(|| no_image(&id.0))
     }

@@ -1,6 +1,7 @@
 //! What went wrong, as an answer: RFC 9457 problems with stable codes.
 
 use axum::{
+    body::Body,
     http::{HeaderValue, StatusCode, header},
     response::{IntoResponse, Response},
 };
@@ -29,16 +30,38 @@ impl Refusal {
     }
 }
 
+/// The problem that an answer is, beside it, for whoever passes it on.
+#[derive(Clone, Debug)]
+pub(super) struct Said(pub(super) Box<Problem>);
+
+impl Said {
+    /// The answer, which says too which request it is about.
+    pub(super) fn with_request_id(self, id: &str, mut answer: Response) -> Response {
+        answer.headers_mut().remove(header::CONTENT_LENGTH);
+        answer.map(|_| Body::from(json(&self.0.with("request_id", id))))
+    }
+}
+
+/// A problem is strings and numbers, which always can be written.
+fn json(problem: &Problem) -> Vec<u8> {
+    serde_json::to_vec(problem).unwrap_or_default()
+}
+
 impl IntoResponse for Refusal {
     fn into_response(self) -> Response {
         let status = StatusCode::from_u16(self.0.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
-        // A problem is strings and numbers, which always can be written.
-        let body = serde_json::to_vec(&self.0).unwrap_or_default();
         let kind = HeaderValue::from_static("application/problem+json");
-        let mut response = (status, [(header::CONTENT_TYPE, kind)], body).into_response();
+        let mut response = (status, [(header::CONTENT_TYPE, kind)], json(&self.0)).into_response();
+        if status == StatusCode::UNAUTHORIZED {
+            let known = if self.0.code == "missing_token" { "" } else { ", error=\"invalid_token\"" };
+            if let Ok(value) = HeaderValue::try_from(format!("Bearer realm=\"rpfd\"{known}")) {
+                response.headers_mut().insert(header::WWW_AUTHENTICATE, value);
+            }
+        }
         if let Some(seconds) = self.0.more.get("retry_after").and_then(serde_json::Value::as_u64) {
             response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
         }
+        response.extensions_mut().insert(Said(self.0));
         response
     }
 }

@@ -1,9 +1,11 @@
 //! Tiles as they come in: the header is judged and its memory reserved before the first plane is read.
 
+use std::time::Instant;
+
 use axum::http::StatusCode;
 use bytes::{Buf, Bytes};
 
-use super::{body::Frames, problem::Refusal, stream::Call};
+use super::{body::Frames, metrics::Phase, problem::Refusal, stream::Call};
 use crate::{
     admission::{AdmissionError, Budget, Permit},
     filter::{
@@ -46,6 +48,7 @@ impl Fault {
 
 /// A tile that is coming in.
 struct Open {
+    began: Instant,
     received: Received,
     counts: CountReader,
     /// Greatest count so far.
@@ -99,6 +102,7 @@ impl Receiver {
                 Step::End => {
                     // Of a tile that was refused nothing was kept.
                     if let Some(open) = self.open.take() {
+                        call.service.metrics.phase(Phase::Receive, open.began);
                         return Ok(Some(open.received));
                     }
                 }
@@ -172,9 +176,12 @@ async fn admit(call: &Call, header: Header) -> Result<Open, Refusal> {
         return Err(too_large(error, &header, &call.method, threads, budget));
     }
     // What this request's own tiles hold will be free again: that is no queue.
-    let permit = budget.reserve_after(needed, call.idle(), call.service.config.queue_deadline).await?;
-    let received = Received { assembler: Assembler::new(&header), plan, permit };
-    Ok(Open { received, counts: CountReader::default(), most: 0, counting: header.varying() })
+    let (waiting, asked) = (call.service.metrics.wait(), Instant::now());
+    let reserved = budget.reserve_after(needed, call.idle(), call.service.config.queue_deadline).await;
+    call.service.metrics.phase(Phase::Queue, asked);
+    drop(waiting);
+    let received = Received { assembler: Assembler::new(&header), plan, permit: reserved? };
+    Ok(Open { began: Instant::now(), received, counts: CountReader::default(), most: 0, counting: header.varying() })
 }
 
 /// The answer to a tile that never fits, with the size that would.

@@ -22,11 +22,13 @@ use futures_util::StreamExt;
 use rayon::ThreadPool;
 use serde_json::json;
 use tokio::{sync::watch, task::JoinSet};
+use tracing::Instrument;
 
 use super::{
     Shared,
     body::Frames,
     images::{Id, Image, Outcome},
+    metrics::Phase,
     picture::{CorePixels, encode_png, write_file},
     problem::{Refusal, corners, internal},
     query::{Form, Parameters, attributes},
@@ -100,6 +102,7 @@ impl Call {
             ..Execution::default()
         };
         let filtered = filter(&tile, &self.method, &execution).ok()?;
+        self.service.metrics.phase(Phase::Filter, started);
         drop(tile);
         held.permit.shrink_to(held.output);
         let seconds = started.elapsed().as_secs_f64();
@@ -108,16 +111,16 @@ impl Call {
         Some((Done { filtered, report }, held))
     }
 
-    /// All that is done with a tile, on a thread that may block.
+    /// All that is done with a tile, on a thread that may block; says what became of it.
     fn process(
         &self,
         received: Received,
         results: &Results,
         pool: &ThreadPool,
         stop: &AtomicBool,
-    ) -> Result<(), Refusal> {
+    ) -> Result<&'static str, Refusal> {
         if stop.load(Ordering::Relaxed) {
-            return Ok(());
+            return Ok("stopped");
         }
         let geometry = *received.assembler.header().geometry();
         let Received { assembler, plan, permit } = received;
@@ -126,31 +129,39 @@ impl Call {
         match &self.target {
             Target::Client => {
                 let Some((Done { filtered, report }, _held)) = self.filter(tile, held, pool, stop) else {
-                    return Ok(());
+                    return Ok("stopped");
                 };
                 let image = [geometry.image().width, geometry.image().height];
+                let began = Instant::now();
                 results.append(|mut out| message::encode_result(image, &filtered, &report, &mut out))?;
+                self.service.metrics.phase(Phase::Write, began);
+                Ok("filtered")
             }
             Target::Image { image, replace } => {
                 let state = match image.offer(&tile, *replace)? {
                     Outcome::Repeated => "repeated",
                     Outcome::Filter(claim) => {
                         let Some((Done { filtered, report }, _held)) = self.filter(tile, held, pool, stop) else {
-                            return Ok(());
+                            return Ok("stopped");
                         };
-                        image.add(claim, &filtered, report.seconds)?
+                        let began = Instant::now();
+                        let state = image.add(claim, &filtered, report.seconds)?;
+                        self.service.metrics.phase(Phase::Write, began);
+                        state
                     }
                 };
                 let line = json!({ "tile": corners(geometry.core()), "state": state });
                 results.append(|out| writeln!(out, "{line}"))?;
+                Ok(state)
             }
         }
-        Ok(())
     }
 
     /// Writes a failure in a result's place.
     async fn report(&self, results: &Arc<Results>, tile: Option<Rect>, problem: Box<Problem>) {
         tracing::debug!(tile = tile.map(tracing::field::display), code = problem.code, "tile refused");
+        self.service.metrics.problem(&problem.code);
+        self.service.metrics.tile("failed");
         let (results, lines) = (Arc::clone(results), self.lines());
         let written = blocking(move || {
             results.append(|mut out| {
@@ -245,7 +256,8 @@ async fn answer(call: Call, request: Request, media: &'static str) -> Result<Res
     let folder = call.service.config.data_dir.clone();
     let (results, reader) = blocking(move || Results::new(&folder)).await??;
     let stop = Stop::default();
-    let session = tokio::spawn(session(Arc::new(call), receiver, received, Arc::new(results), stop.flag()));
+    let session = session(Arc::new(call), receiver, received, Arc::new(results), stop.flag());
+    let session = tokio::spawn(session.in_current_span());
     // The body is dropped when all is sent, or when the client has gone.
     let guard = Guard { session, _stop: stop };
     let body = reader.inspect(move |_| {
@@ -286,7 +298,8 @@ async fn session(
         match next {
             Ok(Some(received)) => {
                 call.busy.send_modify(|tiles| *tiles += 1);
-                jobs.spawn(job(Arc::clone(&call), received, Arc::clone(&results), Arc::clone(&stop)));
+                let job = job(Arc::clone(&call), received, Arc::clone(&results), Arc::clone(&stop));
+                jobs.spawn(job.in_current_span());
                 // One more than can run, so that there always is one to run.
                 if jobs.len() > call.service.work.jobs() {
                     count(jobs.join_next().await);
@@ -323,7 +336,10 @@ async fn job(call: Arc<Call>, received: Received, results: Arc<Results>, stop: A
     let done = call.service.work.run(move |pool| inner.process(received, &out, pool, &stop)).await;
     call.busy.send_modify(|tiles| *tiles -= 1);
     match done.flatten() {
-        Ok(()) => true,
+        Ok(outcome) => {
+            call.service.metrics.tile(outcome);
+            true
+        }
         Err(refusal) => {
             call.report(&results, Some(core), refusal.0).await;
             false
@@ -341,6 +357,7 @@ async fn single(call: Call, request: Request, form: Form) -> Result<Response, Re
     let call = Arc::new(call);
     let inner = Arc::clone(&call);
     let file = call.service.work.run(move |pool| picture(&inner, received, form, pool, &flag)).await??;
+    call.service.metrics.tile("filtered");
     Ok(file_response(file, form.media()).await?)
 }
 

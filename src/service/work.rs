@@ -49,7 +49,8 @@ impl Work {
 
 /// Runs what may block, like reading files, off the threads that serve connections; catches its panics.
 pub(super) async fn blocking<T: Send + 'static>(job: impl FnOnce() -> T + Send + 'static) -> Result<T, Refusal> {
-    spawn_blocking(job).await.map_err(|error| internal(error).into())
+    let span = tracing::Span::current();
+    spawn_blocking(move || span.in_scope(job)).await.map_err(|error| internal(error).into())
 }
 
 /// Tells the jobs of a request to stop when it is dropped: the client has gone, or has all it wanted.
