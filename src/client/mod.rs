@@ -19,6 +19,7 @@ use ureq::{
     Agent, Body, SendBody,
     http::{HeaderValue, Request, Response, header},
     middleware::MiddlewareNext,
+    tls::{RootCerts, TlsConfig},
 };
 
 /// Most bytes of an answer that is no file.
@@ -132,6 +133,8 @@ impl Client {
         // Filtering a tile may take long, and so may waiting for the service's memory; silence between bytes may not.
         let config = Agent::config_builder()
             .http_status_as_error(false)
+            // The certificates that this system trusts; the library itself trusts none.
+            .tls_config(TlsConfig::builder().root_certs(RootCerts::PlatformVerifier).build())
             .user_agent(concat!("rpfd/", env!("CARGO_PKG_VERSION")))
             .timeout_connect(Some(Duration::from_secs(10)))
             .timeout_send_body(Some(Duration::from_secs(600)))

@@ -174,15 +174,15 @@ impl Service {
         let listener = tokio::net::TcpListener::from_std(listener).map_err(failed)?;
         let (stop, stopping) = watch::channel(false);
         let mut connections = JoinSet::new();
-        // Metrics are served to the very end.
+        // Metrics are served to the very end, stopping or not.
+        let (_never, serving) = watch::channel(false);
         let mut beside = JoinSet::new();
         if let Some((listener, _)) = metrics {
             let listener = tokio::net::TcpListener::from_std(listener).map_err(failed)?;
-            let (router, inner, stopping) =
-                (routes::metrics_router(Arc::clone(&inner)), Arc::clone(&inner), stopping.clone());
+            let (router, inner) = (routes::metrics_router(Arc::clone(&inner)), Arc::clone(&inner));
             beside.spawn(async move {
-                let never = std::future::pending();
-                accept(&listener, &router, &stopping, &inner, METRICS_CONNECTIONS, &mut JoinSet::new(), never).await;
+                let (mut connections, never) = (JoinSet::new(), std::future::pending());
+                accept(&listener, &router, &serving, &inner, METRICS_CONNECTIONS, &mut connections, never).await;
             });
         }
         let router = routes::router(Arc::clone(&inner));
