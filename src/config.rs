@@ -93,8 +93,17 @@ pub struct Config {
     pub queue_deadline: Duration,
     /// How long the head of a request may take, and a connection be idle between requests.
     pub header_deadline: Duration,
-    /// How long a request's body may bring nothing while the service waits for it.
+    /// How long a request's body may bring nothing while the service waits for it; and a client that has sent all it
+    /// wants to send, take nothing of the answer.
     pub idle_deadline: Duration,
+    /// Bytes a second that a client must bring, or take, over each `idle_deadline` that it is waited for. 1 to 1 GiB.
+    pub min_rate: ByteSize,
+    /// How long filtering one tile may take.
+    pub work_deadline: Duration,
+    /// Requests that may wait for memory at once; more are refused. 1 to 65536.
+    pub queue: usize,
+    /// Bytes of disk for results that nobody has read yet, of all requests. 1 MiB to [`MAX_MEMORY`].
+    pub unread_results: ByteSize,
     /// How long requests may go on after the service was told to stop.
     pub shutdown_deadline: Duration,
     /// Connections at once; more wait to be accepted. 1 to 65536.
@@ -116,6 +125,10 @@ impl Default for Config {
             queue_deadline: Duration::from_secs(60),
             header_deadline: Duration::from_secs(15),
             idle_deadline: Duration::from_secs(30),
+            min_rate: ByteSize(16 << 10),
+            work_deadline: Duration::from_secs(3600),
+            queue: 1024,
+            unread_results: ByteSize(4 << 30),
             shutdown_deadline: Duration::from_secs(20),
             connections: 1024,
             images: 1024,
@@ -146,14 +159,19 @@ impl Config {
             ("queue_deadline", self.queue_deadline),
             ("header_deadline", self.header_deadline),
             ("idle_deadline", self.idle_deadline),
+            ("work_deadline", self.work_deadline),
             ("shutdown_deadline", self.shutdown_deadline),
         ] {
             let fine = !deadline.is_zero() && deadline <= MAX_DEADLINE;
             rule(fine, name, &format_args!("{}s", deadline.as_secs_f64()), "must be more than 0 and a day at most");
         }
-        for (name, count) in [("connections", self.connections), ("images", self.images)] {
+        for (name, count) in [("connections", self.connections), ("images", self.images), ("queue", self.queue)] {
             rule((1..=65536).contains(&count), name, &count, "must be 1 to 65536");
         }
+        let rate = (1..=1 << 30).contains(&self.min_rate.0);
+        rule(rate, "min_rate", &self.min_rate, "must be 1B to 1GiB");
+        let unread = (MIN_MEMORY..=MAX_MEMORY).contains(&self.unread_results.0);
+        rule(unread, "unread_results", &self.unread_results, "must be 1MiB to 4TiB less 1KiB");
         let pixels = (1..=MAX_IMAGE_PIXELS).contains(&self.image_pixels);
         rule(pixels, "image_pixels", &self.image_pixels, "must be 1 to 2^40");
         if wrong.is_empty() { Ok(()) } else { Err(ConfigError(wrong)) }
@@ -201,13 +219,17 @@ mod tests {
             queue_deadline: Duration::ZERO,
             header_deadline: Duration::ZERO,
             idle_deadline: Duration::ZERO,
+            min_rate: ByteSize(0),
+            work_deadline: Duration::ZERO,
+            queue: 0,
+            unread_results: ByteSize(0),
             shutdown_deadline: Duration::ZERO,
             connections: 0,
             images: 0,
             image_pixels: 0,
             ..Config::default()
         };
-        assert_eq!(zero.validate().unwrap_err().0.len(), 10);
+        assert_eq!(zero.validate().unwrap_err().0.len(), 14);
     }
 
     #[test]
@@ -224,6 +246,8 @@ mod tests {
         assert!(with(&|c| c.idle_deadline = MAX_DEADLINE) && !with(&|c| c.idle_deadline = MAX_DEADLINE + second));
         assert!(with(&|c| c.connections = 65536) && !with(&|c| c.connections = 65537));
         assert!(with(&|c| c.image_pixels = MAX_IMAGE_PIXELS) && !with(&|c| c.image_pixels = MAX_IMAGE_PIXELS + 1));
+        assert!(with(&|c| c.min_rate.0 = 1 << 30) && !with(&|c| c.min_rate.0 = (1 << 30) + 1));
+        assert!(with(&|c| c.unread_results.0 = MIN_MEMORY) && !with(&|c| c.unread_results.0 = MIN_MEMORY - 1));
         assert!(with(&|c| c.images = 1) && !with(&|c| c.images = 65537));
     }
 }

@@ -7,7 +7,10 @@
 //! Threads that serve connections never wait for the disk or for the filter.
 
 mod body;
+mod charge;
 mod images;
+mod inflate;
+mod pace;
 mod picture;
 mod problem;
 mod query;
@@ -29,7 +32,7 @@ use std::{
     time::Duration,
 };
 
-use axum::Router;
+use axum::{Extension, Router};
 use hyper::server::conn::http1;
 use hyper_util::{
     rt::{TokioIo, TokioTimer},
@@ -42,6 +45,7 @@ use crate::{
     config::{Config, ConfigError},
 };
 use images::Images;
+use pace::{OpenBodies, Pace, Watched};
 use work::Work;
 
 /// The service could not start or go on.
@@ -84,14 +88,29 @@ impl ServeError {
     }
 }
 
+/// Bytes that a connection reads, or collects to be written, at a time; the head of a request is no longer.
+const BUFFER: usize = 32 << 10;
+
 /// What all requests share.
 struct Inner {
     config: Config,
+    /// Memory for tiles.
     budget: Budget,
+    /// Memory for requests.
+    requests: Budget,
+    /// Disk for results that nobody has read yet.
+    unread: Budget,
     work: Work,
     images: Images,
     /// Whether the service was told to stop.
     draining: AtomicBool,
+}
+
+impl Inner {
+    /// How slow a client may be.
+    const fn pace(&self) -> Pace {
+        Pace { idle: self.config.idle_deadline, rate: self.config.min_rate.0 }
+    }
 }
 
 type Shared = Arc<Inner>;
@@ -110,13 +129,17 @@ impl Service {
         let data_dir = |source| ServeError::DataDir { path: config.data_dir.clone(), source };
         std::fs::create_dir_all(&config.data_dir).map_err(data_dir)?;
         tempfile::tempfile_in(&config.data_dir).map_err(data_dir)?;
-        let work = Work::new(config.threads)?;
+        let work = Work::new(config.threads, config.work_deadline)?;
         let listen = |source| ServeError::Listen { address: config.listen, source };
         let listener = TcpListener::bind(config.listen).map_err(listen)?;
         listener.set_nonblocking(true).map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
-        let (budget, images) = (Budget::new(config.memory.0), Images::new(config.images));
-        let inner = Arc::new(Inner { config, budget, work, images, draining: AtomicBool::new(false) });
+        let share = charge::share(config.memory.0);
+        let [budget, requests, unread] =
+            [config.memory.0 - share, share, config.unread_results.0].map(|bytes| Budget::new(bytes, config.queue));
+        let images = Images::new(config.images);
+        let inner =
+            Arc::new(Inner { config, budget, requests, unread, work, images, draining: AtomicBool::new(false) });
         Ok(Self { listener, address, inner })
     }
 
@@ -143,8 +166,7 @@ impl Service {
                 Some(_) = connections.join_next() => {}
                 accepted = listener.accept(), if room => match accepted {
                     Ok((stream, _)) => {
-                        let deadline = inner.config.header_deadline;
-                        connections.spawn(serve(stream, router.clone(), stopping.clone(), deadline));
+                        connections.spawn(serve(stream, router.clone(), stopping.clone(), Arc::clone(&inner)));
                     }
                     // Out of file handles, say: others will close theirs.
                     Err(error) => {
@@ -167,12 +189,16 @@ impl Service {
 }
 
 /// Serves one connection until it ends; after the signal to stop only the request that has begun.
-async fn serve(stream: TcpStream, router: Router, mut stopping: watch::Receiver<bool>, header_deadline: Duration) {
+async fn serve(stream: TcpStream, router: Router, mut stopping: watch::Receiver<bool>, inner: Shared) {
     // Small answers should not wait for more.
     let _ = stream.set_nodelay(true);
+    let bodies = OpenBodies::default();
+    let stream = Watched::new(stream, inner.pace(), bodies.clone());
+    let router = router.layer(Extension(bodies));
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
-        .header_read_timeout(header_deadline)
+        .header_read_timeout(inner.config.header_deadline)
+        .max_buf_size(BUFFER)
         .serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
     let mut connection = pin!(connection);
     let stopped = async { stopping.wait_for(|&stop| stop).await.is_ok() };

@@ -1,17 +1,20 @@
 //! Which call goes where.
 
-use std::{sync::atomic::Ordering, time::Instant};
+use std::{
+    sync::{Arc, atomic::Ordering},
+    time::Instant,
+};
 
 use axum::{
     Router,
     extract::{Request, State},
     http::{Method, StatusCode, Uri},
-    middleware::{Next, from_fn, map_request},
+    middleware::{Next, from_fn, from_fn_with_state, map_request},
     response::Response,
     routing::{get, post},
 };
 
-use super::{Shared, body, images, problem::Refusal, stream};
+use super::{Shared, body, charge, images, problem::Refusal, query::NoQuery, stream};
 
 pub(super) fn router(service: Shared) -> Router {
     Router::new()
@@ -22,7 +25,8 @@ pub(super) fn router(service: Shared) -> Router {
         .route("/v1/images/{id}/tiles", post(stream::image_tiles).put(stream::image_tiles))
         .route("/v1/images/{id}/result.exr", get(images::result))
         .route("/v1/images/{id}/preview.png", get(images::preview))
-        .route("/livez", get(|| async { "alive\n" }))
+        .route_layer(from_fn_with_state(Arc::clone(&service), charge::charge))
+        .route("/livez", get(async |_: NoQuery| "alive\n"))
         .route("/readyz", get(ready))
         .fallback(nothing)
         .method_not_allowed_fallback(not_allowed)
@@ -31,7 +35,7 @@ pub(super) fn router(service: Shared) -> Router {
         .with_state(service)
 }
 
-async fn ready(State(service): State<Shared>) -> Result<&'static str, Refusal> {
+async fn ready(State(service): State<Shared>, _: NoQuery) -> Result<&'static str, Refusal> {
     if service.draining.load(Ordering::Relaxed) {
         let detail = "it finishes what it has begun and takes nothing new";
         return Err(Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "draining", "The service is stopping", detail));

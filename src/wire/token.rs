@@ -130,8 +130,8 @@ pub(super) struct Scanner {
 
 impl Scanner {
     /// Ready for the first byte of an object.
-    pub(super) fn new() -> Self {
-        Self { objects: 1, payload: 0, head: HeadReader::default() }
+    pub(super) const fn new() -> Self {
+        Self { objects: 1, payload: 0, head: HeadReader { bytes: [0; MAX_HEAD], len: 0 } }
     }
 
     /// Bytes that must still come at least.

@@ -5,6 +5,7 @@ mod clients;
 mod codes;
 mod curl;
 mod exact;
+pub(crate) mod flow;
 mod images;
 mod limits;
 
@@ -78,6 +79,10 @@ impl Server {
         self.call("POST", path, &[], body)
     }
 
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Tells it to stop, and says how it ended.
     pub(crate) fn terminate(mut self) -> std::process::ExitStatus {
         let id = self.child.id().to_string();
@@ -111,6 +116,10 @@ impl Answer {
         let mut bytes = Vec::new();
         // A connection that is reset after the answer is as good as one that ends.
         let _ = stream.read_to_end(&mut bytes);
+        Self::parse(bytes)
+    }
+
+    pub(crate) fn parse(mut bytes: Vec<u8>) -> Self {
         let end = bytes.windows(4).position(|w| w == b"\r\n\r\n").expect("an answer");
         let head = String::from_utf8(bytes[..end].to_vec()).unwrap();
         let mut lines = head.lines();
