@@ -4,7 +4,7 @@ use std::{net::SocketAddr, path::PathBuf};
 
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::{Failure, FailureKind};
+use super::{Failure, FailureKind, allocator};
 use crate::{
     config::{ByteSize, Config},
     service::{ServeError, Service},
@@ -75,13 +75,19 @@ impl From<ServeError> for Failure {
 pub(crate) fn run(args: Args) -> Result<(), Failure> {
     use std::io::{IsTerminal, Write};
     use tracing_subscriber::EnvFilter;
+    allocator::settle();
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
     log.with_ansi(std::io::stderr().is_terminal()).init();
 
-    let service = Service::bind(args.config()?)?;
+    let config = args.config()?;
+    let threads = config.threads;
+    let service = Service::bind(config)?;
     let failed = |error: std::io::Error| Failure::new(FailureKind::Failed, "runtime", error);
-    let runtime = tokio::runtime::Runtime::new().map_err(failed)?;
+    // Jobs, and what reads and writes files for them and for those who read results.
+    let blocking = threads + 16;
+    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    let runtime = runtime.enable_all().max_blocking_threads(blocking).build().map_err(failed)?;
     let result = runtime.block_on(async {
         let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
         let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;

@@ -88,19 +88,25 @@ impl MapReader {
 
     /// Takes bytes from the front of `input`; the map once it is whole, and then it is ready for another.
     pub(super) fn push(&mut self, input: &mut &[u8]) -> Result<Option<Vec<u8>>, Fault> {
-        let before = *input;
-        let whole = self.scanner.push(input)?;
-        let taken = &before[..before.len() - input.len()];
-        // What is announced counts as well: no need to wait for what will be refused.
-        let size = (self.bytes.len() + taken.len()) as u64;
-        if size.saturating_add(self.wanted()) > self.limit {
-            return Err(Fault::HeaderTooLarge { limit: self.limit });
+        loop {
+            let before = *input;
+            let more = self.scanner.step(input)?;
+            let taken = &before[..before.len() - input.len()];
+            // What is announced counts as well, and as soon as it is: what will be refused need not be waited for, and
+            // it shows at the same byte in pieces of any size.
+            let size = (self.bytes.len() + taken.len()) as u64;
+            if size.saturating_add(self.wanted()) > self.limit {
+                return Err(Fault::HeaderTooLarge { limit: self.limit });
+            }
+            self.bytes.extend_from_slice(taken);
+            if self.scanner.ended() {
+                self.scanner = Scanner::new();
+                return Ok(Some(std::mem::take(&mut self.bytes)));
+            }
+            if !more {
+                return Ok(None);
+            }
         }
-        self.bytes.extend_from_slice(taken);
-        if whole {
-            self.scanner = Scanner::new();
-        }
-        Ok(whole.then(|| std::mem::take(&mut self.bytes)))
     }
 }
 
