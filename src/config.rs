@@ -83,7 +83,9 @@ pub const MAX_DEADLINE: Duration = Duration::from_secs(86_400);
 pub struct Config {
     /// Where to listen; port 0 takes any that is free.
     pub listen: SocketAddr,
-    /// Bytes that tiles may hold at once: samples, buffers of the filter, results. [`MIN_MEMORY`] to [`MAX_MEMORY`].
+    /// Bytes that may be held at once: a share (a quarter up to 64 MiB, then an eighth) by requests, for their buffers and
+    /// the windows of compressed bodies; the rest by tiles: samples, buffers of the filter, results. [`MIN_MEMORY`] to
+    /// [`MAX_MEMORY`].
     pub memory: ByteSize,
     /// Threads that filter: 1 to [`MAX_THREADS`].
     pub threads: usize,

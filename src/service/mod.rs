@@ -1,8 +1,9 @@
 //! The service: tiles in, results and stitched images out, over HTTP. `proto/tile.md` says what it answers.
 //!
-//! One tile goes one way: `body` decompresses frames, `receive` decodes them as they come, after it has reserved the
-//! tile's memory; `stream` hands it to `work`, the pool of threads, and writes what comes out to `results`, a file that
-//! the client reads from, or to the canvas of one of the `images`.
+//! One tile goes one way: `body` reads frames, which `inflate` decompresses, and `receive` decodes them as they come, after
+//! it has reserved the tile's memory; `stream` hands it to `work`, the pool of threads, and writes what comes out to
+//! `results`, a file that the client reads from, or to the canvas of one of the `images`. What a request takes beside its
+//! tiles is a `charge`, and `pace` says how slow its client may be.
 //!
 //! Threads that serve connections never wait for the disk or for the filter.
 
