@@ -102,7 +102,8 @@ settings! {
     data_dir: PathBuf = std::env::var_os("TMPDIR").filter(|dir| !dir.is_empty()).unwrap_or_else(|| "/var/tmp".into()).into(),
         "DIR", |dir| !dir.as_os_str().is_empty(), "must name a folder";
 
-    /// Memory for tiles at work: samples, the filter's buffers, results. 1MiB to 4TiB less 1KiB
+    /// Memory for tiles at work (samples, the filter's buffers, results) and, a share of it (a quarter up to 64 MiB, then
+    /// an eighth), for requests. 1MiB to 4TiB less 1KiB
     memory: ByteSize = ByteSize(1 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_MEMORY).contains(&size.0),
         "must be 1MiB to 4TiB less 1KiB";
 
@@ -131,14 +132,28 @@ settings! {
     /// Pixels of an image, at most; its canvas takes 12 bytes of disk for each. 1 to 2^40
     image_pixels: u64 = 1 << 30, "N", |n| (1..=MAX_IMAGE_PIXELS).contains(n), "must be 1 to 2^40";
 
+    /// Requests that may wait for memory at once; more are refused. 1 to 65536
+    queue: usize = 1024, "N", count, "must be 1 to 65536";
+
+    /// Disk for results that nobody has read yet, of all requests. 1MiB to 4TiB less 1KiB
+    unread_results: ByteSize = ByteSize(4 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_MEMORY).contains(&size.0),
+        "must be 1MiB to 4TiB less 1KiB";
+
+    /// Bytes a second that a client must bring, or take, over each idle_deadline that it is waited for. 1B to 1GiB
+    min_rate: ByteSize = ByteSize(16 << 10), "SIZE", |rate| (1..=1 << 30).contains(&rate.0), "must be 1B to 1GiB";
+
     /// How long a tile may wait for memory before it is refused. Up to a day, like all deadlines
     queue_deadline: Duration = Duration::from_secs(60), "TIME", deadline, "must be more than 0 and a day at most";
 
     /// How long the head of a request may take, and a connection be idle between requests
     header_deadline: Duration = Duration::from_secs(15), "TIME", deadline, "must be more than 0 and a day at most";
 
-    /// How long a request's body may bring nothing while the service waits for it
+    /// How long a request's body may bring nothing while the service waits for it, and a client that has sent all take
+    /// nothing of the answer
     idle_deadline: Duration = Duration::from_secs(30), "TIME", deadline, "must be more than 0 and a day at most";
+
+    /// How long filtering one tile may take
+    work_deadline: Duration = Duration::from_secs(3600), "TIME", deadline, "must be more than 0 and a day at most";
 
     /// How long requests may go on after the service was told to stop
     shutdown_deadline: Duration = Duration::from_secs(20), "TIME", deadline, "must be more than 0 and a day at most";
@@ -204,6 +219,10 @@ mod tests {
             queue_deadline: Duration::ZERO,
             header_deadline: Duration::ZERO,
             idle_deadline: Duration::ZERO,
+            min_rate: ByteSize(0),
+            work_deadline: Duration::ZERO,
+            queue: 0,
+            unread_results: ByteSize(0),
             shutdown_deadline: Duration::ZERO,
             connections: 0,
             streams: 0,
@@ -239,6 +258,10 @@ mod tests {
         assert!(with(&|c| c.streams = 1000) && !with(&|c| c.streams = 1001));
         assert!(with(&|c| c.disk_reserve.0 = 4096) && !with(&|c| c.disk_reserve.0 = 4095));
         assert!(with(&|c| c.image_pixels = MAX_IMAGE_PIXELS) && !with(&|c| c.image_pixels = MAX_IMAGE_PIXELS + 1));
+        assert!(with(&|c| c.queue = MAX_COUNT) && !with(&|c| c.queue = MAX_COUNT + 1));
+        assert!(with(&|c| c.work_deadline = MAX_DEADLINE) && !with(&|c| c.work_deadline = MAX_DEADLINE + second));
+        assert!(with(&|c| c.min_rate.0 = 1 << 30) && !with(&|c| c.min_rate.0 = (1 << 30) + 1));
+        assert!(with(&|c| c.unread_results.0 = MIN_MEMORY) && !with(&|c| c.unread_results.0 = MIN_MEMORY - 1));
         assert!(with(&|c| c.images = 1) && !with(&|c| c.images = MAX_COUNT + 1));
     }
 

@@ -11,6 +11,7 @@ macro_rules! say {
     };
 }
 
+mod allocator;
 mod args;
 mod demo;
 mod failure;

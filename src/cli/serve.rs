@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Arg, ArgMatches};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use super::{Failure, FailureKind};
+use super::{Failure, FailureKind, allocator};
 use crate::{
     config::{
         Config, LogFormat, SETTINGS,
@@ -128,6 +128,7 @@ async fn reload(mut hangup: Signal, reload: Reload) {
 
 pub(crate) fn run(args: Args) -> Result<(), Failure> {
     use std::io::Write;
+    allocator::settle();
     let print = args.print;
     let loaded = args.load()?;
     if print {
@@ -135,9 +136,13 @@ pub(crate) fn run(args: Args) -> Result<(), Failure> {
         return Ok(());
     }
     start_log(&loaded.config);
+    let threads = loaded.config.threads;
     let service = Service::bind(loaded.config)?;
     let failed = |error: std::io::Error| Failure::new(FailureKind::Failed, "runtime", error);
-    let runtime = tokio::runtime::Runtime::new().map_err(failed)?;
+    // Jobs, and what reads and writes files for them and for those who read results.
+    let blocking = threads + 16;
+    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    let runtime = runtime.enable_all().max_blocking_threads(blocking).build().map_err(failed)?;
     let result = runtime.block_on(async {
         let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
         let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;

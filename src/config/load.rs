@@ -15,7 +15,16 @@ use super::{Config, ConfigError, SETTINGS, Setting};
 /// What all environment variables of ours begin with.
 const PREFIX: &str = "RPFD_";
 /// Variables with this beginning that are no settings of the service: the file itself, the client's token, the tests'.
-const OTHERS: [&str; 5] = ["RPFD_CONFIG", "RPFD_TOKEN", "RPFD_DATA", "RPFD_CI", "RPFD_REGENERATE"];
+const OTHERS: [&str; 8] = [
+    "RPFD_CONFIG",
+    "RPFD_TOKEN",
+    "RPFD_DATA",
+    "RPFD_CI",
+    "RPFD_REGENERATE",
+    "RPFD_LOAD",
+    "RPFD_FUZZ",
+    "RPFD_FUZZ_SEED",
+];
 /// Most bytes of a configuration file.
 const MAX_FILE: u64 = 1 << 20;
 

@@ -1,8 +1,8 @@
 //! One connection: HTTP/1.1, or HTTP/2 if the client begins with its preface, both within the same deadlines.
 
-use std::{io, pin::pin, sync::Arc, time::Duration};
+use std::{convert::Infallible, io, pin::pin, sync::Arc, time::Duration};
 
-use axum::Router;
+use axum::{Extension, Router};
 use hyper::{
     Request,
     body::Incoming,
@@ -20,14 +20,17 @@ use tokio::{
     time::timeout,
 };
 
+use super::pace::{OpenBodies, Pace, Taken, Watched};
+
 /// What an HTTP/2 client sends first.
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
-/// Most bytes that HTTP/1.1 reads ahead, and of a request's head.
-const HEAD: usize = 64 << 10;
-/// Bytes that an HTTP/2 client may send on one stream, and in all, before they are read.
-const WINDOWS: (u32, u32) = (256 << 10, 1 << 20);
-/// Most bytes of the answers of one HTTP/2 stream that wait to be sent.
+/// Bytes that a connection over HTTP/1.1, or a stream over HTTP/2, reads ahead; the head of a request is no longer.
+const BUFFER: u32 = 32 << 10;
+/// Most bytes of the answers of one HTTP/2 stream that wait to be sent: with [`BUFFER`] within a request's charge.
 const SEND_BUFFER: usize = 128 << 10;
+
+/// The standard's least window of a connection.
+const MIN_WINDOW: u32 = 65_535;
 
 /// How a connection is served.
 #[derive(Clone, Copy, Debug)]
@@ -36,6 +39,8 @@ pub(super) struct Limits {
     pub(super) header_deadline: Duration,
     /// Requests at once, over HTTP/2.
     pub(super) streams: u32,
+    /// How slow a client may be.
+    pub(super) pace: Pace,
 }
 
 /// A request that is under way on an HTTP/2 connection, as long as one of these lives.
@@ -62,7 +67,8 @@ impl Drop for Active {
 pub(super) async fn serve(stream: TcpStream, router: Router, stopping: watch::Receiver<bool>, limits: Limits) {
     // Small answers should not wait for more.
     let _ = stream.set_nodelay(true);
-    let (mut read, write) = tokio::io::split(stream);
+    let bodies = OpenBodies::default();
+    let (mut read, write) = tokio::io::split(Watched::new(stream, limits.pace, bodies.clone()));
     let mut seen = Vec::new();
     let begun = tokio::select! {
         begun = timeout(limits.header_deadline, first_bytes(&mut read, &mut seen)) => begun,
@@ -74,8 +80,11 @@ pub(super) async fn serve(stream: TcpStream, router: Router, stopping: watch::Re
     }
     let two = seen == PREFACE;
     let io = tokio::io::join(io::Cursor::new(seen).chain(read), write);
-    let result =
-        if two { serve_2(io, router, stopping, limits).await } else { serve_1(io, router, stopping, limits).await };
+    let result = if two {
+        serve_2(io, router, stopping, limits).await
+    } else {
+        serve_1(io, router.layer(Extension(bodies)), stopping, limits).await
+    };
     if let Err(error) = result {
         tracing::debug!(%error, "connection failed");
     }
@@ -108,7 +117,7 @@ async fn serve_1(
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(limits.header_deadline)
-        .max_buf_size(HEAD)
+        .max_buf_size(BUFFER as usize)
         .serve_connection(TokioIo::new(io), TowerToHyperService::new(router));
     let mut connection = pin!(connection);
     tokio::select! {
@@ -127,16 +136,21 @@ async fn serve_2(
     let (active, streams) = watch::channel(0);
     let router = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: Request<Incoming>| {
+        let bodies = OpenBodies::default();
         request.extensions_mut().insert(Stream::new(&active));
-        router.call(request)
+        request.extensions_mut().insert(bodies.clone());
+        let answered = router.call(request);
+        // What is written to the connection does not tell who takes his answer and who does not.
+        async move { Ok::<_, Infallible>(answered.await?.map(|body| Taken::new(body, limits.pace, bodies))) }
     });
     let connection = http2::Builder::new(TokioExecutor::new())
         .timer(TokioTimer::new())
         .max_concurrent_streams(limits.streams)
-        .initial_stream_window_size(WINDOWS.0)
-        .initial_connection_window_size(WINDOWS.1)
+        .initial_stream_window_size(BUFFER)
+        // Enough for all, so that none who waits for memory keeps another from sending.
+        .initial_connection_window_size(limits.streams.saturating_mul(BUFFER).max(MIN_WINDOW))
         .max_send_buf_size(SEND_BUFFER)
-        .max_header_list_size(HEAD as u32)
+        .max_header_list_size(BUFFER)
         // A client that has vanished answers no ping.
         .keep_alive_interval(limits.header_deadline)
         .keep_alive_timeout(limits.header_deadline)

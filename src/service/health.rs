@@ -7,7 +7,7 @@ use std::{
 
 use axum::{extract::State, http::StatusCode};
 
-use super::{Shared, problem::Refusal, work::blocking};
+use super::{Shared, problem::Refusal, query::NoQuery, work::blocking};
 
 /// Why a service that runs should be sent no work.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,12 +76,12 @@ pub(super) fn unready(service: &Shared) -> Option<Refusal> {
 }
 
 /// `GET /livez`.
-pub(super) async fn live() -> &'static str {
+pub(super) async fn live(_: NoQuery) -> &'static str {
     "alive\n"
 }
 
 /// `GET /readyz`.
-pub(super) async fn ready(State(service): State<Shared>) -> Result<&'static str, Refusal> {
+pub(super) async fn ready(State(service): State<Shared>, _: NoQuery) -> Result<&'static str, Refusal> {
     match blocking(move || unready(&service)).await? {
         Some(refusal) => Err(refusal),
         None => Ok("ready\n"),

@@ -18,9 +18,10 @@ use serde_json::{Value, json};
 use super::{
     Shared,
     body::Frames,
+    charge::Charge,
     picture::{encode_png, write_file},
     problem::{Refusal, corners},
-    query::{Form, Parameters, attributes},
+    query::{Form, NoQuery, Parameters, attributes},
     results::file_response,
     work::blocking,
 };
@@ -332,10 +333,10 @@ fn described(body: &[u8], config: &Config) -> Result<Image, Refusal> {
 }
 
 /// `POST /v1/images`.
-pub(super) async fn open(State(service): State<Shared>, request: Request) -> Result<Response, Refusal> {
+pub(super) async fn open(State(service): State<Shared>, charge: Charge, request: Request) -> Result<Response, Refusal> {
     Parameters::of_query(request.uri())?.done("none: an image is described in the body")?;
     let (parts, body) = request.into_parts();
-    let body = Frames::new(&parts.headers, body, service.config.idle_deadline)?.all(MAX_JSON).await?;
+    let body = Frames::new(&parts.headers, body, charge, service.pace())?.all(MAX_JSON).await?;
     let (status, image) = blocking(move || {
         let image = described(&body, &service.config)?;
         let (new, image) = service.images.open(image)?;
@@ -350,21 +351,21 @@ pub(super) async fn open(State(service): State<Shared>, request: Request) -> Res
 }
 
 /// `GET /v1/images`.
-pub(super) async fn list(State(service): State<Shared>) -> Result<Json<Value>, Refusal> {
+pub(super) async fn list(State(service): State<Shared>, _: NoQuery) -> Result<Json<Value>, Refusal> {
     let images: Vec<_> = service.images.with(|all| all.values().cloned().collect());
     let list = blocking(move || images.iter().map(|image| image.summary()).collect::<Value>()).await?;
     Ok(Json(json!({ "images": list })))
 }
 
 /// `GET /v1/images/{id}`.
-pub(super) async fn status(State(service): State<Shared>, id: Id) -> Result<Response, Refusal> {
+pub(super) async fn status(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<Response, Refusal> {
     let image = service.images.find(&id)?;
     let file = blocking(move || write_file(&service.config.data_dir, |out| Ok(image.write_status(out)?)));
     Ok(file_response(file.await??, "application/json").await?)
 }
 
 /// `DELETE /v1/images/{id}`.
-pub(super) async fn delete(State(service): State<Shared>, id: Id) -> Result<StatusCode, Refusal> {
+pub(super) async fn delete(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<StatusCode, Refusal> {
     let removed = service.images.with(|all| all.remove(&id)).ok_or_else(|| no_image(&id.0))?;
     tracing::info!(id = id.0, "image deleted");
     // Closing the last handle of a large file takes a while.

@@ -30,6 +30,7 @@ use super::{
     problem::{Refusal, internal},
     work::blocking,
 };
+use crate::admission::Budget;
 
 /// The content type of what is served.
 const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -119,6 +120,8 @@ pub(super) struct Metrics {
     images: Gauge,
     memory_used: Bytes,
     memory_limit: Bytes,
+    unread_used: Bytes,
+    unread_limit: Bytes,
     disk_free: Bytes,
     disk_size: Bytes,
     ready: Gauge,
@@ -157,6 +160,8 @@ impl Metrics {
             images: Gauge::default(),
             memory_used: Gauge::default(),
             memory_limit: Gauge::default(),
+            unread_used: Gauge::default(),
+            unread_limit: Gauge::default(),
             disk_free: Gauge::default(),
             disk_size: Gauge::default(),
             ready: Gauge::default(),
@@ -185,8 +190,14 @@ impl Metrics {
         own.register("queue_length", "Tiles that wait for memory", all.waiting.clone());
         own.register("connections", "Open connections", all.connections.clone());
         own.register("images_open", "Images that are open", all.images.clone());
-        own.register_with_unit("memory_used", "Memory reserved for tiles", Unit::Bytes, all.memory_used.clone());
-        own.register_with_unit("memory_limit", "Memory that tiles may have", Unit::Bytes, all.memory_limit.clone());
+        for (name, help, gauge) in [
+            ("memory_used", "Memory reserved for tiles and requests", &all.memory_used),
+            ("memory_limit", "Memory that tiles and requests may have", &all.memory_limit),
+            ("unread_results", "Disk reserved for results that nobody has read yet", &all.unread_used),
+            ("unread_results_limit", "Disk that such results may have", &all.unread_limit),
+        ] {
+            own.register_with_unit(name, help, Unit::Bytes, gauge.clone());
+        }
         own.register_with_unit(
             "disk_free",
             "Free space of the data folder's file system",
@@ -250,9 +261,12 @@ impl Metrics {
     /// All of it as text. Blocks.
     fn render(&self, service: &Shared) -> Result<String, Refusal> {
         let bytes = |bytes: u64| i64::try_from(bytes).unwrap_or(i64::MAX);
-        let budget = &service.budget;
-        self.memory_limit.set(bytes(budget.total()));
-        self.memory_used.set(bytes(budget.total() - budget.free()));
+        let (tiles, requests, unread) = (&service.budget, &service.requests, &service.unread);
+        let used = |budget: &Budget| budget.total() - budget.free();
+        self.memory_limit.set(bytes(tiles.total() + requests.total()));
+        self.memory_used.set(bytes(used(tiles) + used(requests)));
+        self.unread_limit.set(bytes(unread.total()));
+        self.unread_used.set(bytes(used(unread)));
         self.images.set(bytes(service.images.count() as u64));
         self.ready.set(unready(service).is_none().into());
         if let Ok(disk) = disk(&service.config.data_dir) {

@@ -1,18 +1,22 @@
 //! The service: tiles in, results and stitched images out, over HTTP. `proto/tile.md` says what it answers.
 //!
-//! One tile goes one way: `body` decompresses frames, `receive` decodes them as they come, after it has reserved the
-//! tile's memory; `stream` hands it to `work`, the pool of threads, and writes what comes out to `results`, a file that
-//! the client reads from, or to the canvas of one of the `images`.
+//! One tile goes one way: `body` reads frames, which `inflate` decompresses, and `receive` decodes them as they come, after
+//! it has reserved the tile's memory; `stream` hands it to `work`, the pool of threads, and writes what comes out to
+//! `results`, a file that the client reads from, or to the canvas of one of the `images`. What a request takes beside its
+//! tiles is a `charge`, and `pace` says how slow its client may be.
 //!
 //! Threads that serve connections never wait for the disk or for the filter.
 
 pub mod auth;
 mod body;
+mod charge;
 mod connection;
 mod health;
 mod images;
+mod inflate;
 mod metrics;
 mod openapi;
+mod pace;
 mod picture;
 mod problem;
 mod query;
@@ -44,6 +48,7 @@ use connection::Limits;
 use health::{Readiness, Reason};
 use images::Images;
 use metrics::{Counted, Metrics};
+use pace::Pace;
 use work::Work;
 
 /// Connections at once to the address for metrics.
@@ -96,12 +101,24 @@ impl ServeError {
 /// What all requests share.
 struct Inner {
     config: Config,
+    /// Memory for tiles.
     budget: Budget,
+    /// Memory for requests.
+    requests: Budget,
+    /// Disk for results that nobody has read yet.
+    unread: Budget,
     work: Work,
     images: Images,
     auth: Auth,
     metrics: Metrics,
     readiness: Readiness,
+}
+
+impl Inner {
+    /// How slow a client may be.
+    const fn pace(&self) -> Pace {
+        Pace { idle: self.config.idle_deadline, rate: self.config.min_rate.0 }
+    }
 }
 
 type Shared = Arc<Inner>;
@@ -142,13 +159,16 @@ impl Service {
         let data_dir = |source| ServeError::DataDir { path: config.data_dir.clone(), source };
         std::fs::create_dir_all(&config.data_dir).map_err(data_dir)?;
         tempfile::tempfile_in(&config.data_dir).map_err(data_dir)?;
-        let work = Work::new(config.threads)?;
+        let work = Work::new(config.threads, config.work_deadline)?;
         let (listener, address) = listen(config.listen)?;
         let metrics = config.metrics_listen.map(listen).transpose()?;
-        let (budget, images) = (Budget::new(config.memory.0), Images::new(config.images));
+        let share = charge::share(config.memory.0);
+        let [budget, requests, unread] =
+            [config.memory.0 - share, share, config.unread_results.0].map(|bytes| Budget::new(bytes, config.queue));
+        let images = Images::new(config.images);
         let (counts, readiness) = (Metrics::new(), Readiness::default());
-        let inner = Arc::new(Inner { config, budget, work, images, auth, metrics: counts, readiness });
-        Ok(Self { listener, address, metrics, inner })
+        let inner = Inner { config, budget, requests, unread, work, images, auth, metrics: counts, readiness };
+        Ok(Self { listener, address, metrics, inner: Arc::new(inner) })
     }
 
     /// The address it listens on, with the port that it got.
@@ -211,7 +231,8 @@ async fn accept(
     shutdown: impl Future<Output = ()>,
 ) {
     let mut shutdown = pin!(shutdown);
-    let limits = Limits { header_deadline: inner.config.header_deadline, streams: inner.config.streams };
+    let limits =
+        Limits { header_deadline: inner.config.header_deadline, streams: inner.config.streams, pace: inner.pace() };
     loop {
         let room = connections.len() < limit;
         tokio::select! {

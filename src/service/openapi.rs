@@ -21,7 +21,7 @@ use utoipa::{
     },
 };
 
-use super::{Shared, health, images, stream};
+use super::{Shared, health, images, query::NoQuery, stream};
 use crate::filter::{Method, method::PRESETS};
 
 /// A call: its handlers, and what is told of them.
@@ -291,7 +291,7 @@ pub(super) fn document() -> String {
 }
 
 /// `GET /openapi.json`.
-async fn serve() -> impl IntoResponse {
+async fn serve(_: NoQuery) -> impl IntoResponse {
     ([(header::CONTENT_TYPE, "application/json")], document())
 }
 

@@ -14,6 +14,9 @@ use crate::{
     wire::{Problem, WireError},
 };
 
+/// Most seconds after which a client is asked to come again.
+const MAX_RETRY_AFTER: f64 = 600.0;
+
 /// An answer that is not what was asked for.
 #[derive(Debug)]
 pub(super) struct Refusal(pub(super) Box<Problem>);
@@ -125,11 +128,11 @@ impl From<AdmissionError> for Problem {
                     .with("needed", needed)
                     .with("available", total)
             }
-            // Who waited in vain for so long may as well wait that long again.
-            AdmissionError::Busy { needed, deadline } => {
+            AdmissionError::Busy { needed, retry_after, .. } => {
+                let seconds = retry_after.as_secs_f64().ceil().min(MAX_RETRY_AFTER) as u64;
                 Self::new(503, error.code(), "The service's memory is in use", detail)
                     .with("needed", needed)
-                    .with("retry_after", deadline.as_secs().clamp(1, 60))
+                    .with("retry_after", seconds.max(1))
             }
         }
     }
@@ -179,12 +182,14 @@ mod tests {
 
     #[test]
     fn an_answer_is_problem_json_and_says_when_to_come_again() {
-        let deadline = std::time::Duration::from_millis(200);
-        let refusal = Refusal::from(AdmissionError::Busy { needed: 5, deadline });
-        let response = refusal.into_response();
-        assert_eq!(response.status(), 503);
-        assert_eq!(response.headers()["content-type"], "application/problem+json");
-        assert_eq!(response.headers()["retry-after"], "1");
+        for (millis, seconds) in [(0, "1"), (1000, "1"), (1001, "2"), (90_000, "90"), (9_999_999_999, "600")] {
+            let [waited, retry_after] = [200, millis].map(std::time::Duration::from_millis);
+            let refusal = Refusal::from(AdmissionError::Busy { needed: 5, waited, retry_after });
+            let response = refusal.into_response();
+            assert_eq!(response.status(), 503);
+            assert_eq!(response.headers()["content-type"], "application/problem+json");
+            assert_eq!(response.headers()["retry-after"], seconds);
+        }
     }
 
     #[test]

@@ -7,12 +7,18 @@ use axum::{
     routing::get,
 };
 
-use super::{Shared, auth, body, metrics, openapi, problem::Refusal, trace};
+use super::{Shared, auth, body, charge, metrics, openapi, problem::Refusal, trace};
 
 pub(super) fn router(service: Shared) -> Router {
-    let calls = openapi::calls().into_iter();
-    calls
-        .fold(Router::new(), |router, call| router.route(call.path, call.handlers))
+    let charged = from_fn_with_state(service.clone(), charge::charge);
+    openapi::calls()
+        .into_iter()
+        .fold(Router::new(), |router, call| {
+            // Not what says how the service is: that has to be known most when memory is short.
+            let handlers = call.handlers;
+            let free = !call.path.starts_with("/v1/");
+            router.route(call.path, if free { handlers } else { handlers.route_layer(charged.clone()) })
+        })
         .fallback(nothing)
         .method_not_allowed_fallback(not_allowed)
         // The last of these comes first.

@@ -119,6 +119,53 @@ fn requests_at_once_are_bounded() {
     assert_eq!(streams[2..], [0, 0, 0, 7]);
 }
 
+/// A frame of a stream.
+fn frame(kind: u8, flags: u8, stream: u8, payload: &[u8]) -> Vec<u8> {
+    let length = u8::try_from(payload.len()).unwrap();
+    [&[0, 0, length, kind, flags, 0, 0, 0, stream][..], payload].concat()
+}
+
+/// HEADERS of a whole request without a body.
+fn get(stream: u8, path: &str) -> Vec<u8> {
+    let field = |index: u8, value: &str| [&[index, u8::try_from(value.len()).unwrap()], value.as_bytes()].concat();
+    frame(1, 5, stream, &[&[0x82, 0x86][..], &field(0x04, path), &field(0x01, "test")].concat())
+}
+
+/// The next frame of this stream: its kind and payload.
+fn next_frame(connection: &mut TcpStream, stream: u8) -> (u8, Vec<u8>) {
+    loop {
+        let mut head = [0; 9];
+        connection.read_exact(&mut head).unwrap();
+        let mut payload = vec![0; usize::from(head[1]) << 8 | usize::from(head[2])];
+        connection.read_exact(&mut payload).unwrap();
+        if head[5..] == [0, 0, 0, stream] {
+            return (head[3], payload);
+        }
+    }
+}
+
+#[test]
+fn an_answer_that_is_not_taken_is_let_go_of() {
+    let server =
+        Server::start(&["--idle-deadline", "200ms", "--header-deadline", "10m", "--metrics-listen", "127.0.0.1:0"]);
+    let mut stream = server.connect();
+    // No bytes of any stream are wanted before more is said.
+    let no_window = frame(4, 0, 0, &[0, 4, 0, 0, 0, 0]);
+    stream.write_all(&[PREFACE, &no_window, &get(1, "/v1/images")].concat()).unwrap();
+    let answered = "rpfd_requests_total{route=\"/v1/images\",method=\"GET\",status=\"200\"}";
+    wait_until("it is answered", || server.metric(answered) == Some(1.0));
+    wait_until("it is given up", || server.metric("rpfd_requests_in_flight") == Some(0.0));
+    wait_until("its memory is free", || server.metric("rpfd_memory_used_bytes") == Some(0.0));
+    let more = |id: u8| frame(8, 0, id, &[0, 0, 4, 0]);
+    stream.write_all(&more(1)).unwrap();
+    assert_eq!(next_frame(&mut stream, 1).0, 1, "HEADERS");
+    assert_eq!(next_frame(&mut stream, 1).0, 3, "RST_STREAM, and no DATA");
+    // The others of the connection go on.
+    stream.write_all(&[get(3, "/livez"), more(3)].concat()).unwrap();
+    assert_eq!(next_frame(&mut stream, 3).0, 1);
+    assert_eq!(next_frame(&mut stream, 3), (0, b"alive\n".to_vec()));
+}
+
 #[test]
 fn stopping_ends_what_has_begun() {
     if !has("curl", "--version") {

@@ -7,6 +7,7 @@ mod config;
 mod curl;
 mod deploy;
 mod exact;
+pub(crate) mod flow;
 mod http2;
 mod images;
 mod limits;
@@ -114,6 +115,10 @@ impl Server {
         self.call("POST", path, &[], body)
     }
 
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Tells it to stop, and says how it ended.
     pub(crate) fn terminate(self) -> std::process::ExitStatus {
         self.signal("-TERM");
@@ -153,6 +158,10 @@ impl Answer {
         let mut bytes = Vec::new();
         // A connection that is reset after the answer is as good as one that ends.
         let _ = stream.read_to_end(&mut bytes);
+        Self::parse(bytes)
+    }
+
+    pub(crate) fn parse(mut bytes: Vec<u8>) -> Self {
         let end = bytes.windows(4).position(|w| w == b"\r\n\r\n").expect("an answer");
         let head = String::from_utf8(bytes[..end].to_vec()).unwrap();
         let mut lines = head.lines();
