@@ -6,6 +6,7 @@
 pub mod load;
 mod value;
 
+use crate::filter::SimdLevel;
 use std::{
     fmt,
     net::{Ipv4Addr, SocketAddr},
@@ -113,6 +114,10 @@ settings! {
     /// Threads that filter, 1 to 1024. By default one per CPU
     threads: usize = std::thread::available_parallelism().map_or(1, |n| n.get().min(MAX_THREADS)), "N",
         |n| (1..=MAX_THREADS).contains(n), "must be 1 to 1024";
+
+    /// SIMD instructions to filter with, for the same bits in more time: auto for the best that this CPU has, or one of
+    /// its levels, like sse4.2 or avx2
+    simd: SimdLevel = SimdLevel::default(), "LEVEL", |_| true, "";
 
     /// Connections at once; more wait to be accepted. 1 to 65536
     connections: usize = 1024, "N", count, "must be 1 to 65536";
@@ -235,9 +240,10 @@ mod tests {
             token_file: None,
             insecure_no_auth: false,
             log_format: LogFormat::Text,
+            simd: SimdLevel::default(),
         };
         // All but those that have no wrong value.
-        assert_eq!(zero.validate().unwrap_err().0.len(), SETTINGS.len() - 4);
+        assert_eq!(zero.validate().unwrap_err().0.len(), SETTINGS.len() - 5);
     }
 
     #[test]

@@ -56,6 +56,43 @@ fn measure(
     (ALLOCATIONS.peak_usage() as u64 - before + given, planned)
 }
 
+/// A tile of 27 planes that vary takes its samples once, and what the plan says for each thread; all else is at most three
+/// tenths of the samples.
+#[test]
+fn a_tile_takes_its_samples_once_and_three_tenths_more() {
+    let whole = Rect::new(0, 0, 96, 96);
+    let geometry = TileGeometry::with_halo([96, 96], whole, 0).expect("a valid geometry");
+    // Film 2, colour 3, features 15, random parameters 7 in pairs and one alone.
+    let mut channels = channels(5, 3).channels().to_vec();
+    channels.push(Channel::new("time", Role::Random { uniform: true }, 1));
+    let channels = ChannelSet::new(channels).expect("valid channels");
+    assert_eq!(channels.planes(), 27);
+    for preset in ["lean", "paper-fast"] {
+        let quick: &[_] = if preset == "lean" { &[] } else { &[("fractions", "0.002,0.004,0.03,0.05")] };
+        let method = Method::with(preset, quick.iter().copied()).expect("valid");
+        for threads in [1, 2] {
+            let counts = Counts::Uniform(8);
+            let shape = Shape {
+                geometry: &geometry,
+                channels: &channels,
+                samples: whole.area() * 8,
+                max_per_pixel: 8,
+                varying: false,
+            };
+            let planned = plan(&shape, &method);
+            let scratch = planned.per_thread * threads as u64;
+            let (peak, _) = measure(geometry, channels.clone(), counts, &method, threads, true);
+            let beside = peak - scratch - planned.samples;
+            println!(
+                "{preset} on {threads} threads: samples {}, scratch {scratch}, beside {beside} ({:.1} %)",
+                planned.samples,
+                100.0 * beside as f64 / planned.samples as f64
+            );
+            assert!(beside * 10 <= planned.samples * 3, "{preset}: {beside} bytes beside {}", planned.samples);
+        }
+    }
+}
+
 #[test]
 fn plans_are_upper_bounds_and_tight() {
     let tile = |image: u32, core: u32, halo: u32| {
@@ -65,6 +102,7 @@ fn plans_are_upper_bounds_and_tight() {
     let quick = [("fractions", "0.002,0.004,0.03,0.05")];
     let methods = [
         Method::preset("lean").expect("a preset"),
+        Method::with("lean", [("tolerance", "0.5")]).expect("valid"),
         Method::preset("unfiltered").expect("a preset"),
         Method::with("gaussian", [("sigma", "5")]).expect("valid"),
         Method::with("bilateral", [("color_scale", "log")]).expect("valid"),

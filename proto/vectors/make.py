@@ -203,7 +203,9 @@ def bad_tiles():
 
 def results():
     report = {"preset": "lean", "seed": 1, "seconds": 0.5, "samples": 4, "spikes": 0, "exact": True,
-              "halo": [0, 0, 0, 0], "halo_needed": [0, 0, 0, 0], "left_out": [{"plane": "lens.0", "reason": "constant"}]}
+              "halo": [0, 0, 0, 0], "halo_needed": [0, 0, 0, 0],
+              "left_out": [{"plane": "color.1", "reason": "equal"}, {"plane": "lens.0", "reason": "constant"}],
+              "left_out_bytes": 64, "work": {"done": 300, "planes": 60, "columns": 30, "distances": 10, "saved": 0.25}}
     result = {"type": "result", "version": 1, "image": [4, 3], "tile": [0, 0, 2, 1], "report": report}
     planes = [pack(np.asarray(p, "<f4").tobytes()) for p in ([1, 2], [3, 4], [5, 6])]
     problem = {"type": "urn:rpfd:problem:too_large", "title": "Too large", "status": 413, "detail": "it is", "code": "too_large", "limit": 5}

@@ -3,7 +3,7 @@
 use super::failure::Failure;
 use crate::{
     filter::{
-        Method, ParameterError,
+        Method, ParameterError, SimdLevel,
         method::{Algorithm, PRESETS},
     },
     stitch::{
@@ -26,6 +26,13 @@ pub(crate) struct MethodArgs {
     /// Set one of the preset's parameters; may be given several times
     #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting, help = SET_HELP.as_str())]
     settings: Vec<(String, String)>,
+    /// Whether what can have no effect is left out, like planes that are constant: off takes longer, for the same image
+    #[arg(long, value_name = "on|off", default_value = "on", value_parser = ["on", "off"])]
+    leave_out: String,
+    /// Pass pixels through whose samples say that filtering can take less than this off their relMSE, to save time: 0,
+    /// none, to 1; short for --set tolerance=E
+    #[arg(long, value_name = "E")]
+    tolerance: Option<String>,
 }
 
 static PRESET_HELP: LazyLock<String> = LazyLock::new(|| {
@@ -64,14 +71,26 @@ fn setting(text: &str) -> Result<(String, String), String> {
 impl MethodArgs {
     /// The method, checked.
     pub(crate) fn method(&self) -> Result<Method, ParameterError> {
-        Method::with(&self.preset, self.settings.iter().map(|(name, value)| (name, value)))
+        Method::with(&self.preset, self.settings())
     }
 
-    /// As the service takes it: preset, seed, and the parameters that were set.
+    /// What is set, the last of a name counts.
+    fn settings(&self) -> impl Iterator<Item = (&str, &str)> {
+        let tolerance = self.tolerance.iter().map(|value| ("tolerance", value.as_str()));
+        self.settings.iter().map(|(name, value)| (name.as_str(), value.as_str())).chain(tolerance)
+    }
+
+    /// Whether what can have no effect is left out.
+    pub(crate) fn leave_out(&self) -> bool {
+        self.leave_out == "on"
+    }
+
+    /// As the service takes it: preset, seed, the parameters that were set, and that nothing is to be left out.
     pub(crate) fn to_json(&self, method: &Method) -> serde_json::Value {
-        let settings = self.settings.iter().map(|(name, value)| (name.clone(), value.clone().into()));
+        let settings = self.settings().map(|(name, value)| (name.to_owned(), value.into()));
         let own = [("preset".to_owned(), method.preset_name().into()), ("seed".to_owned(), self.seed.into())];
-        settings.chain(own).collect::<serde_json::Map<_, _>>().into()
+        let all = (!self.leave_out()).then(|| ("leave_out".to_owned(), false.into()));
+        settings.chain(own).chain(all).collect::<serde_json::Map<_, _>>().into()
     }
 }
 
@@ -151,6 +170,15 @@ impl ThreadArgs {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(count).thread_name(|i| format!("compute-{i}")).build();
         pool.map(Some).map_err(|error| Failure::failed("threads", format!("cannot start {count} threads: {error}")))
     }
+}
+
+/// With which SIMD instructions.
+#[derive(clap::Args)]
+pub(crate) struct SimdArgs {
+    /// SIMD instructions to compute with, for the same bits in more time: auto for the best that this CPU has, or one
+    /// of its levels, sse2, sse4.2, avx2 or avx512
+    #[arg(long = "simd", env = "RPFD_SIMD", value_name = "LEVEL", default_value = "auto")]
+    pub(crate) level: SimdLevel,
 }
 
 /// Reads a size like `640x480`.

@@ -1,7 +1,7 @@
 //! `rpfd demo`: everything once, on a real render.
 
 use super::{
-    args::MethodArgs,
+    args::{MethodArgs, SimdArgs},
     failure::Failure,
     filter::Offline,
     input::Input,
@@ -41,6 +41,8 @@ pub(crate) struct Args {
     /// Print what was found as JSON
     #[arg(long)]
     pub(crate) json: bool,
+    #[command(flatten)]
+    simd: SimdArgs,
     #[command(flatten)]
     method: MethodArgs,
 }
@@ -110,6 +112,7 @@ fn mean(args: &Args, input: &Input, path: &Path) -> Result<f64, Failure> {
         method: Method::preset("unfiltered")?,
         seed: 0,
         leave_out: true,
+        simd: args.simd.level,
         threads: 1,
         pool: None,
         stop: Default::default(),
@@ -136,6 +139,7 @@ fn through_the_service(args: &Args, method: &Method, input: &Input, path: &Path)
     let config = Config {
         listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 0)),
         data_dir: folder.path().to_owned(),
+        simd: args.simd.level,
         ..Config::default()
     };
     let threads = config.threads;

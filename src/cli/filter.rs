@@ -1,7 +1,7 @@
 //! `rpfd filter`: a file of tiles in, an EXR out, without a service.
 
 use super::{
-    args::{ExrArgs, MethodArgs, ThreadArgs},
+    args::{ExrArgs, MethodArgs, SimdArgs, ThreadArgs},
     failure::Failure,
     input::Input,
     progress,
@@ -9,10 +9,11 @@ use super::{
 };
 use crate::{
     config::ByteSize,
-    filter::{Execution, Filtered, Halo, Method, SampleTile, Stopped, filter},
+    filter::{Execution, Filtered, Halo, Method, SampleTile, SimdLevel, Stopped, filter},
     picture::write_png,
     stitch::{ExrOptions, Offer, Pixels, Stitcher, atomic::AtomicFile},
     store::spool::Spool,
+    wire::message::WorkCounts,
 };
 use indicatif::{HumanBytes, ProgressBar};
 use serde_json::{Value, json};
@@ -54,9 +55,8 @@ pub(crate) struct Args {
     temp_dir: Option<PathBuf>,
     #[command(flatten)]
     threads: ThreadArgs,
-    /// Whether what can have no effect is left out, like planes that are constant: off takes longer, for the same file
-    #[arg(long, value_name = "on|off", default_value = "on", value_parser = ["on", "off"])]
-    leave_out: String,
+    #[command(flatten)]
+    simd: SimdArgs,
     /// Print what was done as JSON
     #[arg(long)]
     pub(crate) json: bool,
@@ -87,7 +87,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let offline = Offline {
         method,
         seed: args.method.seed,
-        leave_out: args.leave_out == "on",
+        leave_out: args.method.leave_out(),
+        simd: args.simd.level,
         threads: args.threads.count(),
         pool: args.threads.pool()?,
         stop: progress::interrupted(),
@@ -147,6 +148,7 @@ pub(crate) struct Offline<'a> {
     pub(crate) seed: u64,
     /// Whether what can have no effect is left out.
     pub(crate) leave_out: bool,
+    pub(crate) simd: SimdLevel,
     pub(crate) threads: usize,
     pub(crate) pool: Option<rayon::ThreadPool>,
     pub(crate) stop: Arc<AtomicBool>,
@@ -221,7 +223,7 @@ impl Offline<'_> {
             stop: Some(&self.stop),
             progress: Some(&advance),
             leave_out: self.leave_out,
-            ..Execution::default()
+            simd: self.simd,
         };
         let filtered = filter(tile, &self.method, &execution)?;
         bar.set_position(before + core.area());
@@ -273,6 +275,7 @@ impl Run {
             "image": input.image(),
             "seconds": seconds,
             "threads": offline.threads,
+            "simd": offline.simd.name(),
             "preset": offline.method.preset_name(),
             "seed": offline.seed,
             "parameters": offline.method.parameters().into_iter().collect::<BTreeMap<_, _>>(),
@@ -297,9 +300,24 @@ impl Run {
             "left_out": left_out
                 .map(|((plane, reason), tiles)| json!({ "plane": plane, "reason": reason, "tiles": tiles }))
                 .collect::<Vec<_>>(),
+            "settled": totals.settled,
+            "settled_error": totals.settled_error,
+            "left_out_bytes": totals.left_out_bytes,
+            "work": totals.work.map(WorkCounts::from),
             "memory": { "limit": offline.memory.0, "planned": self.schedule.bytes },
             "spool": spooled,
         })
+    }
+}
+
+/// Why planes were left out.
+fn reason_in_words(reason: &str) -> &str {
+    match reason {
+        "constant" => "they are constant",
+        "missing" => "no sample has them",
+        "unused" => "the method does not look at them",
+        "equal" => "they equal an earlier colour plane",
+        other => other,
     }
 }
 
@@ -322,6 +340,26 @@ fn print_summary(args: &Args, run: &Run, seconds: f64) {
         totals.energy_out / totals.energy_in,
         totals.spikes
     );
+    let mut left_out: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for (plane, reason) in run.stitcher.left_out().keys() {
+        left_out.entry(reason).or_default().push(plane);
+    }
+    for (reason, planes) in left_out {
+        say!("left out, since {}: {}", reason_in_words(reason), planes.join(", "));
+    }
+    if let Some(work) = totals.work.filter(|work| work.saved() > 0) {
+        let bytes = HumanBytes(totals.left_out_bytes);
+        say!("which saved about {:.0} % of the work, and {bytes} of planes", 100.0 * work.saved_share());
+    }
+    if totals.settled > 0 {
+        let (share, error) =
+            (totals.settled as f64 / totals.pixels as f64, totals.settled_error / totals.pixels as f64);
+        let percent = 100.0 * share;
+        say!(
+            "{} pixels ({percent:.1} %) were within the tolerance and passed through: relMSE + {error:.2e} at most, on average",
+            totals.settled
+        );
+    }
     if totals.replaced.total() > 0 {
         say!("{} values were not finite and were replaced", totals.replaced.total());
     }

@@ -6,7 +6,11 @@ use super::{
     input::Input,
 };
 use crate::{
-    filter::{Halo, Method, Role, method::PRESETS, plan::plan},
+    filter::{
+        Halo, Method, Role,
+        method::{Algorithm, PRESETS},
+        plan::{forecast, plan},
+    },
     wire::scan::PlaneSummary,
 };
 use indicatif::HumanBytes;
@@ -39,7 +43,7 @@ Examples:
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let method = args.method.method()?;
     let input = Input::scan(&args.input)?;
-    let report = report(&input, &method, args.threads.count())?;
+    let report = report(&input, &method, args.method.leave_out(), args.threads.count())?;
     if args.json {
         say!("{report:#}")
     } else {
@@ -49,7 +53,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 /// Everything, for programs.
-fn report(input: &Input, method: &Method, threads: usize) -> Result<Value, Failure> {
+fn report(input: &Input, method: &Method, leave_out: bool, threads: usize) -> Result<Value, Failure> {
     let summary = &input.summary;
     let tiles = || summary.tiles.iter();
     let core_areas = tiles().map(|tile| tile.geometry.core().area());
@@ -58,9 +62,13 @@ fn report(input: &Input, method: &Method, threads: usize) -> Result<Value, Failu
     let channels = summary.first.channels().plane_channels().enumerate().map(|(index, (channel, component))| {
         let first = index - component as usize;
         let all = &summary.planes[first..first + channel.components as usize];
-        (channel.role, channel.zero_is_missing() && all.iter().all(zero))
+        let none = channel.zero_is_missing() && all.iter().all(zero);
+        let reason = left_out(&summary.planes[first..=index], channel.role, none, method);
+        // Without leaving anything out, what a method does not look at is not looked at all the same.
+        (channel.role, reason.filter(|why| leave_out || *why == "unused"))
     });
-    let planes = summary.planes.iter().zip(channels).map(|(plane, (role, none))| {
+    let channels: Vec<_> = channels.collect();
+    let planes = summary.planes.iter().zip(&channels).map(|(plane, &(role, reason))| {
         let range = (plane.finite > 0).then_some([plane.min, plane.max]);
         json!({
             "name": plane.name,
@@ -72,10 +80,15 @@ fn report(input: &Input, method: &Method, threads: usize) -> Result<Value, Failu
             "nan": plane.nan,
             "infinite": plane.infinite,
             "constant_tiles": plane.constant_tiles,
-            "left_out": left_out(plane, role, none, method),
+            "left_out": reason,
         })
     });
     let planes: Vec<_> = planes.collect();
+    let without: Vec<usize> = (0..channels.len()).filter(|&plane| channels[plane].1.is_some()).collect();
+    let pixels: u64 = core_areas.clone().sum();
+    let per_pixel = (summary.samples as f64 / pixels as f64).round() as u32;
+    let work = forecast(summary.first.channels(), per_pixel.max(1), method, &without);
+    let plane_bytes = tiles().map(|tile| tile.samples * size_of::<f32>() as u64).sum::<u64>();
     let presets = PRESETS.iter().map(|(name, _)| Method::preset(name).map_err(Failure::from));
     let mut halos = Vec::new();
     for preset in presets {
@@ -103,6 +116,11 @@ fn report(input: &Input, method: &Method, threads: usize) -> Result<Value, Failu
         },
         "planes": planes,
         "preset": method.preset_name(),
+        "left_out": {
+            "planes": without.len(),
+            "bytes": without.len() as u64 * plane_bytes,
+            "saved": work.map(|work| work.saved_share()),
+        },
         "halo_needed": halos,
         "memory": {
             "threads": threads,
@@ -138,11 +156,16 @@ const fn role_name(role: Role) -> &'static str {
     }
 }
 
-/// Why a plane has no effect in any tile, if so; `none` says that no sample has the feature.
-fn left_out(plane: &PlaneSummary, role: Role, none: bool, method: &Method) -> Option<&'static str> {
+/// Why a plane, the last of these of a channel, has no effect in any tile, if so; `none` says that no sample has the
+/// feature.
+fn left_out(planes: &[PlaneSummary], role: Role, none: bool, method: &Method) -> Option<&'static str> {
+    let (plane, earlier) = planes.split_last()?;
     let holes = plane.nan + plane.infinite;
     match role {
-        Role::Color => None,
+        Role::Color => {
+            let equal = earlier.iter().any(|earlier| earlier.digest == plane.digest);
+            (equal && matches!(method.algorithm(), Algorithm::Rpf(_))).then_some("equal")
+        }
         _ if !method.reads(&role) => Some("unused"),
         _ if none || (plane.finite == 0 && plane.infinite == 0) => Some("missing"),
         _ if plane.min >= plane.max && holes == 0 => Some("constant"),
@@ -177,6 +200,14 @@ fn print(report: &Value) {
         let (name, role, format) = (text(&plane["name"]), text(&plane["role"]), text(&plane["format"]));
         let (min, max, mean) = (number("min"), number("max"), number("mean"));
         say!("{name:<16} {role:<8} {format:<4} {min:>13} {max:>13} {mean:>13}  {}", notes.join(", "));
+    }
+    let left_out = &report["left_out"];
+    if left_out["planes"] != 0 {
+        let saved = left_out["saved"].as_f64();
+        let saved = saved.map_or_else(String::new, |s| {
+            format!(", and about {:.0} % of the work of {}", 100.0 * s, text(&report["preset"]))
+        });
+        say!("leaving out {} planes saves {} of planes{saved}", left_out["planes"], bytes(&left_out["bytes"]));
     }
     say!(
         "\nhalo, [left, top, right, bottom]: {} at least, {} at most",

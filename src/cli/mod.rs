@@ -13,6 +13,7 @@ macro_rules! say {
 
 mod allocator;
 mod args;
+mod cost;
 mod demo;
 mod failure;
 mod filter;
@@ -53,6 +54,7 @@ Examples:
 
 #[derive(clap::Subcommand)]
 enum Command {
+    Cost(Box<cost::Args>),
     Demo(demo::Args),
     Filter(Box<filter::Args>),
     Inspect(inspect::Args),
@@ -67,6 +69,7 @@ enum Command {
 /// Parses the command line, runs the command, and says how it went.
 pub fn main() -> ExitCode {
     let (json, result) = match Cli::parse().command {
+        Command::Cost(args) => (args.json_errors(), cost::run(&args)),
         Command::Demo(args) => (args.json, demo::run(&args)),
         Command::Filter(args) => (args.json, filter::run(&args)),
         Command::Inspect(args) => (args.json, inspect::run(&args)),

@@ -15,7 +15,7 @@ use super::{Config, ConfigError, SETTINGS, Setting};
 /// What all environment variables of ours begin with.
 const PREFIX: &str = "RPFD_";
 /// Variables with this beginning that are no settings of the service: the file itself, the client's token, the tests'.
-const OTHERS: [&str; 8] = [
+const OTHERS: [&str; 12] = [
     "RPFD_CONFIG",
     "RPFD_TOKEN",
     "RPFD_DATA",
@@ -24,6 +24,10 @@ const OTHERS: [&str; 8] = [
     "RPFD_LOAD",
     "RPFD_FUZZ",
     "RPFD_FUZZ_SEED",
+    "RPFD_WORKLOAD",
+    "RPFD_FAULTS",
+    "RPFD_SEED",
+    "RPFD_SIDE",
 ];
 /// Most bytes of a configuration file.
 const MAX_FILE: u64 = 1 << 20;

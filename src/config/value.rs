@@ -2,6 +2,8 @@
 
 use std::{fmt, net::SocketAddr, path::PathBuf, str::FromStr, time::Duration};
 
+use crate::filter::{SimdLevel, SimdLevelError};
+
 /// A number of bytes. Read from `512MiB`, `2GiB`, `64kB` or plain bytes; binary units count by 1024, decimal by 1000.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ByteSize(pub u64);
@@ -197,6 +199,17 @@ impl<T: Value> Value for Option<T> {
 
     fn to_toml(&self) -> Option<String> {
         self.as_ref().and_then(T::to_toml)
+    }
+}
+
+impl Value for SimdLevel {
+    fn read(text: &str) -> Result<Self, String> {
+        text.parse().map_err(|error: SimdLevelError| error.to_string())
+    }
+
+    fn to_toml(&self) -> Option<String> {
+        // Not the best level's name: another machine may have another.
+        Some(quoted(if *self == Self::default() { "auto" } else { self.name() }))
     }
 }
 

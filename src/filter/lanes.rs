@@ -16,6 +16,21 @@ pub(crate) const LANES: usize = 16;
 /// Sixteen lanes at one SIMD level.
 pub(crate) type Lanes<S> = fearless_simd::f32x16<S>;
 
+/// Eight lanes of f64.
+pub(crate) type Wide<S> = fearless_simd::f64x8<S>;
+
+/// Sixty-four lanes of signed 8 bits.
+pub(crate) type Octets<S> = fearless_simd::i8x64<S>;
+
+/// Eight lanes of 64 bits.
+pub(crate) type Words<S> = fearless_simd::u64x8<S>;
+
+/// Sixteen lanes of signed 32 bits.
+pub(crate) type Signed<S> = fearless_simd::i32x16<S>;
+
+/// Sixteen lanes of 32 bits.
+pub(crate) type Integers<S> = fearless_simd::u32x16<S>;
+
 /// `n` rounded up to whole lanes.
 pub(crate) const fn padded(n: usize) -> usize {
     n.next_multiple_of(LANES)
@@ -31,10 +46,46 @@ impl Default for SimdLevel {
     }
 }
 
+/// A level that is not among those of this CPU.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("this CPU has no SIMD level {0:?}: write auto for the best, or one that it has: {has}", has = SimdLevel::names().join(", "))]
+pub struct SimdLevelError(String);
+
+impl std::str::FromStr for SimdLevel {
+    type Err = SimdLevelError;
+
+    /// Reads `auto` or the name of a level that this CPU has.
+    fn from_str(text: &str) -> Result<Self, SimdLevelError> {
+        let named = || Self::available().into_iter().find(|(name, _)| *name == text).map(|(_, level)| level);
+        let level = if text == "auto" { Some(Self::default()) } else { named() };
+        level.ok_or_else(|| SimdLevelError(text.to_owned()))
+    }
+}
+
+impl PartialEq for SimdLevel {
+    fn eq(&self, other: &Self) -> bool {
+        self.name() == other.name()
+    }
+}
+
 impl SimdLevel {
     /// The levels that this CPU has, lowest first, with their names.
     pub fn available() -> Vec<(&'static str, Self)> {
-        let best = Level::new();
+        Self::up_to(Level::new())
+    }
+
+    /// The names of the levels that this CPU has, lowest first.
+    pub fn names() -> Vec<&'static str> {
+        Self::available().into_iter().map(|(name, _)| name).collect()
+    }
+
+    /// Its name, as [`SimdLevel::available`] has it.
+    pub fn name(self) -> &'static str {
+        Self::up_to(self.0).last().map_or("none", |(name, _)| name)
+    }
+
+    /// A level and those below it, lowest first, with their names.
+    fn up_to(best: Level) -> Vec<(&'static str, Self)> {
         let mut levels = Vec::new();
         #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
         {
@@ -57,10 +108,23 @@ impl SimdLevel {
 /// Sum of the lanes in a fixed tree: lane i with lane i + 8, then + 4, + 2, + 1.
 #[inline(always)]
 pub(crate) fn sum<S: Simd>(lanes: Lanes<S>) -> f32 {
-    let a: [f32; LANES] = lanes.to_array();
-    let b: [f32; 8] = std::array::from_fn(|i| a[i] + a[i + 8]);
-    let c: [f32; 4] = std::array::from_fn(|i| b[i] + b[i + 4]);
-    (c[0] + c[2]) + (c[1] + c[3])
+    let (low, high) = lanes.split();
+    let (low, high) = (low + high).split();
+    let last: [f32; 4] = (low + high).to_array();
+    (last[0] + last[2]) + (last[1] + last[3])
+}
+
+/// Rows become columns: lane `i` of vector `j` becomes lane `j` of vector `i`.
+#[inline(always)]
+pub(crate) fn transpose<S: Simd>(vectors: &mut [Lanes<S>; LANES]) {
+    // A perfect shuffle moves the highest bit of the vector's number to the lowest of the lane's, and the highest of the
+    // lane's to the lowest of the vector's; four of them exchange the two.
+    for _ in 0..LANES.ilog2() {
+        let old = *vectors;
+        for i in 0..LANES / 2 {
+            (vectors[2 * i], vectors[2 * i + 1]) = old[i].interleave(old[i + LANES / 2]);
+        }
+    }
 }
 
 /// Lanes below `n` are kept, the others become 0.
@@ -69,8 +133,13 @@ pub(crate) fn keep_first<S: Simd>(simd: S, lanes: Lanes<S>, n: usize) -> Lanes<S
     if n >= LANES {
         return lanes;
     }
-    let mask = fearless_simd::mask32x16::from_bitmask(simd, (1 << n) - 1);
-    mask.select(lanes, Lanes::splat(simd, 0.0))
+    select_lanes(simd, (1 << n) - 1, lanes, Lanes::splat(simd, 0.0))
+}
+
+/// Lanes whose bit is set are of `a`, the others of `b`.
+#[inline(always)]
+pub(crate) fn select_lanes<S: Simd>(simd: S, bits: u64, a: Lanes<S>, b: Lanes<S>) -> Lanes<S> {
+    fearless_simd::mask32x16::from_bitmask(simd, bits).select(a, b)
 }
 
 /// Beyond this, [`exp_neg`] is 0: e^-80 is 1.8e-35.
@@ -93,8 +162,8 @@ pub(crate) fn exp_neg<S: Simd>(simd: S, x: Lanes<S>) -> Lanes<S> {
     for c in [1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0] {
         p = p * r + lanes(c);
     }
-    let exponent: fearless_simd::u32x16<S> = (k + lanes(127.0)).to_int();
-    near.select(p * Lanes::from_bits(exponent << 23), lanes(0.0))
+    let exponent: Signed<S> = (k + lanes(127.0)).to_int();
+    near.select(p * (exponent << 23).bitcast::<Lanes<S>>(), lanes(0.0))
 }
 
 #[cfg(test)]
@@ -124,6 +193,17 @@ mod tests {
             assert!(worst < 2.5e-7, "{name}: relative error {worst:e}");
             assert_eq!(*reference.get_or_insert_with(|| bits.clone()), bits, "{name}");
         }
+    }
+
+    #[test]
+    fn levels_have_names() {
+        for (name, level) in SimdLevel::available() {
+            assert_eq!((name.parse(), level.name()), (Ok(level), name));
+        }
+        assert_eq!("auto".parse(), Ok(SimdLevel::default()));
+        assert_eq!(SimdLevel::names().last(), Some(&SimdLevel::default().name()));
+        let error = "mmx".parse::<SimdLevel>().unwrap_err().to_string();
+        assert!(error.contains("\"mmx\"") && error.ends_with(&SimdLevel::names().join(", ")), "{error}");
     }
 
     #[test]

@@ -36,13 +36,16 @@ pub mod oracle;
 pub mod plan;
 pub mod rpf;
 pub mod samples;
+pub mod scalar;
 mod share;
+mod work;
 
 pub use coverage::Coverage;
 pub use geometry::{Halo, Rect, TileGeometry};
-pub use lanes::SimdLevel;
+pub use lanes::{SimdLevel, SimdLevelError};
 pub use method::{Method, ParameterError};
 pub use samples::{Channel, ChannelSet, Counts, Plane, Role, SampleTile};
+pub use work::Work;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -113,18 +116,33 @@ pub struct Report {
     pub filled: u64,
     /// Pixels without samples that stayed black, since no neighbour had any.
     pub unfilled: u64,
+    /// Pixels with samples that were passed through, since filtering could take less than the tolerance off their relMSE.
+    pub settled: u64,
+    /// Sum over these pixels of what filtering could have taken off at most, by estimate: divided by the number of all
+    /// pixels it is what the image's relMSE may be higher for it.
+    pub settled_error: f64,
     /// The halo that the tile had.
     pub halo: Halo,
     /// The halo that it would need for the same bits as in the whole image.
     pub halo_needed: Halo,
     /// Planes that the method did not need to look at, and why.
     pub left_out: Vec<LeftOut>,
+    /// Bytes of these planes, over the data window: those that are constant or missing were not kept, the others not read.
+    pub left_out_bytes: u64,
+    /// How much was done, and how much left out, by estimate; of RPF only.
+    pub work: Option<Work>,
 }
 
 impl Report {
     /// Whether the tile had all the context that the method reads.
     pub const fn exact(&self) -> bool {
         self.halo.covers(&self.halo_needed)
+    }
+
+    /// Says which planes of a tile were left out.
+    fn leaving_out(self, left_out: Vec<LeftOut>, tile: &SampleTile) -> Self {
+        let left_out_bytes = left_out.len() as u64 * tile.total() as u64 * size_of::<f32>() as u64;
+        Self { left_out, left_out_bytes, ..self }
     }
 }
 
@@ -147,15 +165,18 @@ pub enum LeftOutReason {
     Missing,
     /// The method does not look at such planes.
     Unused,
+    /// A colour plane with the values of an earlier one: what becomes of that one is its result as well.
+    Equal,
 }
 
 impl LeftOutReason {
-    /// A stable word for reports: `constant`, `missing`, `unused`.
+    /// A stable word for reports: `constant`, `missing`, `unused`, `equal`.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Constant => "constant",
             Self::Missing => "missing",
             Self::Unused => "unused",
+            Self::Equal => "equal",
         }
     }
 }

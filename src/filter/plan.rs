@@ -1,6 +1,7 @@
 //! What a tile will cost, as a function of its shape, before any of it is allocated.
 
-use super::{ChannelSet, Method, TileGeometry, method::Algorithm};
+use super::rpf::work::{self, Columns};
+use super::{ChannelSet, Method, TileGeometry, Work, method::Algorithm};
 
 /// The shape of a tile's samples, as its header announces it.
 #[derive(Clone, Copy, Debug)]
@@ -58,4 +59,12 @@ pub fn plan(shape: &Shape, method: &Method) -> Plan {
         Algorithm::Rpf(params) => super::rpf::plan(shape, params),
     };
     Plan { samples, output, ..own }
+}
+
+/// What share of the work leaving out some planes will save, for pixels with so many samples; none if the method does not
+/// say. Planes alone are counted, as if every candidate were accepted: columns that are constant over a neighbourhood
+/// only, and what weighs nothing, add to it.
+pub fn forecast(channels: &ChannelSet, samples: u32, method: &Method, left_out: &[usize]) -> Option<Work> {
+    let Algorithm::Rpf(params) = method.algorithm() else { return None };
+    Some(work::forecast(params, samples, &Columns::of(channels, &[]), &Columns::of(channels, left_out)))
 }

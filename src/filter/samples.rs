@@ -4,7 +4,7 @@
 //! each component is a *plane* of `f32`, and every plane has one value per sample. Pixels are in row-major order, the
 //! samples of a pixel next to each other. A plane whose values are all equal is kept as that one value.
 
-use super::geometry::TileGeometry;
+use super::geometry::{Rect, TileGeometry};
 
 /// Most planes a tile may have: components of all channels together.
 pub const MAX_PLANES: usize = 256;
@@ -287,6 +287,14 @@ impl SampleLayout {
         }
     }
 
+    /// Room for a part of so many pixels; varying if this one is.
+    pub(crate) fn with_capacity(&self, pixels: usize) -> Self {
+        match self {
+            Self::Uniform { .. } => Self::Uniform { per_pixel: 0, pixels: 0 },
+            Self::Varying { .. } => Self::Varying { starts: Vec::with_capacity(pixels + 1) },
+        }
+    }
+
     /// Number of samples in all.
     pub(crate) fn total(&self) -> usize {
         match self {
@@ -424,6 +432,32 @@ impl SampleTile {
     /// The samples of a pixel, by its row-major index in the data window: a range of positions in each plane.
     pub fn samples_of(&self, pixel: usize) -> std::ops::Range<usize> {
         self.layout.of(pixel)
+    }
+
+    /// Sets `layout`, from [`SampleLayout::with_capacity`] of this tile's, to that of a part of the data window alone.
+    pub(crate) fn set_layout_of(&self, part: &Rect, layout: &mut SampleLayout) {
+        let window = self.geometry.window();
+        match layout {
+            SampleLayout::Uniform { per_pixel, pixels } => {
+                (*per_pixel, *pixels) = (self.max_per_pixel(), part.area() as u32);
+            }
+            SampleLayout::Varying { starts } => {
+                starts.clear();
+                starts.push(0);
+                let mut total = 0;
+                for y in part.y..part.bottom() {
+                    for x in part.x..part.right() {
+                        total += self.samples_of(window.index(x, y)).len() as u32;
+                        starts.push(total);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Where each pixel's samples lie in the planes.
+    pub(crate) const fn layout(&self) -> &SampleLayout {
+        &self.layout
     }
 
     /// Whether the pixels may have different numbers of samples.

@@ -1,6 +1,7 @@
 //! The report as one page that needs nothing else: no scripts, no fonts, no files beside it.
 
 use super::{
+    cost::{self, Costs},
     machine::Machine,
     plots,
     rows::{BASE, Row},
@@ -21,6 +22,8 @@ pub struct Page<'a> {
     pub machine: &'a Machine,
     /// Seconds per megapixel that rendering one sample per pixel takes, if that was said.
     pub seconds_per_sample: Option<f64>,
+    /// What filtering costs, if that was measured.
+    pub cost: Option<&'a Costs>,
 }
 
 const STYLE: &str = "\
@@ -31,6 +34,7 @@ h1{font-size:1.6rem}h2{font-size:1.2rem;margin-top:2.2rem}
 table{border-collapse:collapse;font-size:12px;white-space:nowrap;font-variant-numeric:tabular-nums}
 th,td{padding:.15rem .5rem;text-align:right;border-bottom:1px solid #8884}
 .formulas td,.formulas th{white-space:normal;text-align:left;vertical-align:top}
+.words.words{white-space:normal;text-align:left;min-width:24rem}
 td:nth-child(1),td:nth-child(3),th:nth-child(1),th:nth-child(3){text-align:left}
 tr.base td{opacity:.65}tr.front td:nth-child(3){font-weight:bold}
 figure{display:inline-block;margin:0 .4rem .8rem 0;font-size:12px}
@@ -61,8 +65,20 @@ pub fn page(page: &Page) -> String {
                 independent samples give.</p>\n";
         samples.iter().for_each(|panel| out += &draw(std::slice::from_ref(panel), 2));
     }
+    if let Some(costs) = page.cost {
+        cost::show::section(&mut out, costs);
+    }
     out += "<h2>Numbers</h2>\n";
     numbers(&mut out, page);
+    let tables = [
+        ("With and without a tolerance", table::tolerances(page.rows), table::TOLERANCE_NOTE),
+        ("Left out", table::left_out(page.rows), table::LEFT_OUT_NOTE),
+    ];
+    for (title, (headings, cells), note) in tables.iter().filter(|(_, (_, cells), _)| !cells.is_empty()) {
+        let _ = writeln!(out, "<h2>{title}</h2>\n<p class=\"note\">{}</p>", escape(note));
+        let rows: Vec<_> = cells.iter().map(|cells| ("", &cells[..])).collect();
+        lay_out(&mut out, headings, &rows);
+    }
     out += "<h2>Pictures</h2>\n<p class=\"note\">The middle of each image at its most samples, at most 64 x 64 pixels, each \
             drawn twice as large: sRGB, exposure 0, clipped. A difference is |x - r|, shown the same way.</p>\n";
     pictures(&mut out, page);
@@ -91,22 +107,35 @@ pub fn page(page: &Page) -> String {
     out
 }
 
-fn numbers(out: &mut String, page: &Page) {
-    let (headings, cells) = table::cells(page.rows, page.seconds_per_sample);
+/// A table; each row with its attributes.
+fn lay_out(out: &mut String, headings: &[&str], rows: &[(&str, &[String])]) {
     *out += "<div class=\"wide\"><table>\n<thead><tr>";
-    headings.iter().for_each(|heading| *out += &format!("<th>{}</th>", escape(heading)));
+    for heading in headings {
+        let class = if *heading == "planes" { " class=\"words\"" } else { "" };
+        let _ = write!(out, "<th{class}>{}</th>", escape(heading));
+    }
     *out += "</tr></thead>\n<tbody>\n";
-    for (row, cells) in page.rows.iter().zip(cells) {
-        let class = match (row.key.preset == BASE, row.pareto) {
-            (true, _) => " class=\"base\"",
-            (_, true) => " class=\"front\"",
-            _ => "",
-        };
-        let _ = write!(out, "<tr{class}>");
-        cells.iter().for_each(|cell| *out += &format!("<td>{}</td>", escape(cell)));
+    for (attributes, cells) in rows {
+        let _ = write!(out, "<tr{attributes}>");
+        for (cell, heading) in cells.iter().zip(headings) {
+            let class = if *heading == "planes" { " class=\"words\"" } else { "" };
+            let _ = write!(out, "<td{class}>{}</td>", escape(cell));
+        }
         *out += "</tr>\n";
     }
-    *out += "</tbody></table></div>\n<ul class=\"note\">\n";
+    *out += "</tbody></table></div>\n";
+}
+
+fn numbers(out: &mut String, page: &Page) {
+    let (headings, cells) = table::cells(page.rows, page.seconds_per_sample);
+    let class = |row: &Row| match (row.key.preset == BASE, row.pareto) {
+        (true, _) => " class=\"base\"",
+        (_, true) => " class=\"front\"",
+        _ => "",
+    };
+    let rows: Vec<_> = page.rows.iter().zip(&cells).map(|(row, cells)| (class(row), &cells[..])).collect();
+    lay_out(out, &headings, &rows);
+    *out += "<ul class=\"note\">\n";
     let notes = &table::NOTES[..if page.seconds_per_sample.is_some() { 6 } else { 5 }];
     notes.iter().for_each(|note| *out += &format!("<li>{}</li>\n", escape(note)));
     if let Some(seconds) = page.seconds_per_sample {

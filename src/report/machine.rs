@@ -2,11 +2,11 @@
 
 use crate::filter::SimdLevel;
 use rustix::time::{ClockId, clock_gettime};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::fs;
 
 /// The machine and the program.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Machine {
     /// What the processor calls itself.
     pub cpu: String,
@@ -21,8 +21,8 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// This one.
-    pub fn here() -> Self {
+    /// This one, where the filter uses this SIMD level.
+    pub fn here(simd: SimdLevel) -> Self {
         let line = |path: &str, key: &str| {
             let text = fs::read_to_string(path).ok()?;
             let line = text.lines().find_map(|line| line.strip_prefix(key))?;
@@ -34,10 +34,24 @@ impl Machine {
         Self {
             cpu: line("/proc/cpuinfo", "model name").unwrap_or_else(unknown),
             cores: std::thread::available_parallelism().map_or(1, std::num::NonZeroUsize::get),
-            simd: SimdLevel::available().last().map_or_else(unknown, |(name, _)| (*name).to_owned()),
+            simd: simd.name().to_owned(),
             os: format!("{name}{}, {}", kernel.unwrap_or_default(), std::env::consts::ARCH),
             version: format!("rpfd {}", env!("CARGO_PKG_VERSION")),
         }
+    }
+}
+
+impl Machine {
+    /// The version of the program, and what tells this build of it from any other: BLAKE3 of its file, where that can be
+    /// read. Times measured by another build are not this one's.
+    pub fn build() -> String {
+        let version = env!("CARGO_PKG_VERSION");
+        let hash = || {
+            let mut hasher = blake3::Hasher::new();
+            hasher.update_reader(fs::File::open(std::env::current_exe().ok()?).ok()?).ok()?;
+            Some(hasher.finalize().to_hex()[..16].to_owned())
+        };
+        hash().map_or_else(|| version.to_owned(), |hash| format!("{version}+{hash}"))
     }
 }
 
@@ -54,7 +68,16 @@ pub fn reset_peak() -> bool {
 
 /// Greatest resident size of this process in bytes, since the last [`reset_peak`].
 pub fn peak_resident() -> Option<u64> {
+    status("VmHWM:")
+}
+
+/// Resident size of this process in bytes.
+pub fn resident() -> Option<u64> {
+    status("VmRSS:")
+}
+
+fn status(key: &str) -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let line = status.lines().find_map(|line| line.strip_prefix(key))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib << 10)
 }

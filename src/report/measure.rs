@@ -6,11 +6,12 @@ use super::{
 };
 use crate::{
     filter::{
-        Execution, Method, SampleTile, Stopped, filter,
+        Execution, Method, Report, SampleTile, Stopped, filter,
         plan::{Shape, plan},
     },
     picture::{PictureError, write_png},
 };
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::time::Instant;
 
@@ -28,10 +29,41 @@ pub struct Measurement {
     pub wall: f64,
     /// Bytes that the filter said it would need, samples included.
     pub planned: u64,
+    /// What was left out and passed through.
+    pub spared: Spared,
     /// Greatest resident size of the whole process while it filtered, in bytes, where the system tells.
     pub peak: Option<u64>,
     /// What it looks like, as PNGs in base64: the middle of the image, and its difference from the reference.
     pub pictures: Option<[String; 2]>,
+}
+
+/// What the filter did not do, as its report says.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Spared {
+    /// Planes left out, and why.
+    pub planes: Vec<(String, String)>,
+    /// Bytes of these planes.
+    pub bytes: u64,
+    /// Share of the work that was left out, by estimate, 0 to 1; none if the method does not tell.
+    pub work: Option<f64>,
+    /// Share of pixels that were passed through, within the tolerance, 0 to 1.
+    pub settled: f64,
+    /// What that adds to relMSE at most, on average, by estimate.
+    pub settled_error: f64,
+}
+
+impl Spared {
+    fn of(report: &Report, pixels: u64) -> Self {
+        let planes = report.left_out.iter().map(|l| (l.plane.clone(), l.reason.as_str().to_owned()));
+        Self {
+            planes: planes.collect(),
+            bytes: report.left_out_bytes,
+            work: report.work.map(|work| work.saved_share()),
+            settled: report.settled as f64 / pixels as f64,
+            settled_error: report.settled_error / pixels as f64,
+        }
+    }
 }
 
 /// A measurement that was not made.
@@ -77,7 +109,8 @@ pub fn measure(
     let difference: Vec<_> =
         pixels.iter().zip(reference).map(|(x, r)| [0, 1, 2].map(|c| (x[c] - r[c]).abs())).collect();
     let pictures = Some([middle(&pixels, width)?, middle(&difference, width)?]);
-    Ok(Measurement { scores, cpu, wall, planned, peak, pictures })
+    let spared = Spared::of(&filtered.report, core.area());
+    Ok(Measurement { scores, cpu, wall, planned, spared, peak, pictures })
 }
 
 /// The middle of an image of linear RGB, at most 64 x 64 pixels, as a PNG in base64.
@@ -113,7 +146,7 @@ impl Measurement {
     pub fn to_json(&self) -> Value {
         json!({
             "scores": self.scores.to_json(), "cpu_seconds": number(self.cpu), "wall_seconds": number(self.wall),
-            "planned_bytes": self.planned, "peak_resident_bytes": self.peak, "pictures": self.pictures,
+            "planned_bytes": self.planned, "spared": self.spared, "peak_resident_bytes": self.peak, "pictures": self.pictures,
         })
     }
 
@@ -125,6 +158,7 @@ impl Measurement {
             cpu: value["cpu_seconds"].as_f64()?,
             wall: value["wall_seconds"].as_f64()?,
             planned: value["planned_bytes"].as_u64()?,
+            spared: Spared::deserialize(&value["spared"]).ok()?,
             peak: value["peak_resident_bytes"].as_u64(),
             pictures: picture(0).zip(picture(1)).map(|(a, b)| [a, b]),
         })

@@ -5,11 +5,13 @@
 //! - [`measure`]: one measurement; [`state`] keeps those that are done.
 //! - [`rows`]: medians, the Pareto front, and how many plain samples would do as well.
 //! - [`table`], [`html`], [`plots`], [`svg`]: what a reader gets to see.
+//! - [`cost`]: what filtering costs, and how that grows.
 //! - [`stability`]: how stable the filter is, in stiff and extreme cases.
 //!
 //! Errors are reproducible: they depend on the samples, the method and the seed only, and are computed in `f64` with `+
 //! - * /`, square roots and the pure-Rust `libm`. Times are what they are on the [`machine`].
 
+pub mod cost;
 pub mod display;
 pub mod flip;
 pub mod html;

@@ -26,11 +26,14 @@ pub struct Key {
     pub parameters: Vec<String>,
     /// Threads that filtered.
     pub threads: usize,
+    /// SIMD level that they used.
+    #[serde(default)]
+    pub simd: String,
     /// Keys the method's random draws.
     pub seed: u64,
     /// 0 for the first time the same is measured.
     pub repeat: u32,
-    /// Version of the program.
+    /// Version and build of the program.
     pub version: String,
 }
 

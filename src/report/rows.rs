@@ -1,6 +1,11 @@
 //! What the measurements say together: a row for each data set, sample count, method and number of threads.
 
-use super::{measure::Measurement, plan::Key, scores::Scores};
+use super::{
+    measure::{Measurement, Spared},
+    plan::Key,
+    scores::Scores,
+};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// The preset that the others are compared with.
@@ -17,7 +22,7 @@ pub struct Own {
 }
 
 /// The median of what was measured several times, and how far it went.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Spread {
     /// Of an even number the mean of the two in the middle.
     pub median: f64,
@@ -58,6 +63,8 @@ pub struct Row {
     pub repeats: usize,
     /// Bytes that the filter said it would need.
     pub planned: u64,
+    /// What was left out and passed through.
+    pub spared: Spared,
     /// Greatest resident size of the process, in bytes; of the repeats the median.
     pub peak: Option<u64>,
     /// No other row of the same data set, samples and threads has both less error and less processor time.
@@ -90,6 +97,16 @@ impl Row {
     pub fn plain_relmse(&self, seconds_per_sample: f64) -> Option<f64> {
         let samples = self.cost(seconds_per_sample) / seconds_per_sample;
         self.equal_spp.map(|equal| self.relmse() * libm::pow(samples / equal, self.slope.value()))
+    }
+
+    /// The row of the same method without a tolerance, if this one has any.
+    pub fn without_tolerance<'a>(&self, rows: &'a [Self]) -> Option<&'a Self> {
+        let has = |row: &Self| row.key.parameters.iter().any(|p| p.starts_with("tolerance=") && p != "tolerance=0");
+        let others = |row: &Self| -> Vec<String> {
+            row.key.parameters.iter().filter(|p| !p.starts_with("tolerance=")).cloned().collect()
+        };
+        let same = |row: &&Self| row.key.preset == self.key.preset && others(row) == others(self);
+        has(self).then(|| rows.iter().filter(|row| self.peers(row) && !has(row)).find(same)).flatten()
     }
 
     fn peers(&self, other: &Self) -> bool {
@@ -160,6 +177,7 @@ fn row(key: Key, label: &str, group: &[&Measurement], own: &BTreeMap<String, Own
         wall: spread(|m| m.wall),
         repeats: group.len(),
         planned: first.planned,
+        spared: first.spared.clone(),
         peak: (!peaks.is_empty()).then(|| Spread::of(peaks).median as u64),
         pareto: false,
         equal_spp: None,
@@ -204,13 +222,22 @@ mod tests {
             preset: preset.into(),
             parameters: Vec::new(),
             threads: 1,
+            simd: "any".into(),
             seed: 0,
             repeat,
             version: "0".into(),
         };
         let mut scores = Scores([0.0; 9]);
         scores.0[1] = relmse;
-        let measurement = Measurement { scores, cpu, wall: 2.0 * cpu, planned: 7, peak: None, pictures: None };
+        let measurement = Measurement {
+            scores,
+            cpu,
+            wall: 2.0 * cpu,
+            planned: 7,
+            spared: Spared::default(),
+            peak: None,
+            pictures: None,
+        };
         (key, preset.to_owned(), measurement)
     }
 

@@ -55,28 +55,31 @@ pub fn draw(panels: &[Panel], across: usize) -> String {
     let columns = across.clamp(1, panels.len().max(1));
     let width = SIZE[0] * columns as f64;
     let height = SIZE[1] * panels.len().div_ceil(columns) as f64;
-    let (legend, legend_height) = legend(panels, width, height);
+    // Above, so that it is seen before the first panel, however many there are.
+    let (legend, legend_height) = legend(panels, width);
     let mut out = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {all}\" width=\"{width}\" height=\"{all}\" role=\"img\" \
          font-family=\"sans-serif\" font-size=\"11\">\n<style>.t{{fill:#333}}.g{{stroke:#888;stroke-opacity:.3}}\
          @media(prefers-color-scheme:dark){{.t{{fill:#ddd}}}}</style>\n",
         all = height + legend_height
     );
+    out += &legend;
     for (index, panel) in panels.iter().enumerate() {
-        let (x, y) = ((index % columns) as f64 * SIZE[0], (index / columns) as f64 * SIZE[1]);
+        let (x, y) = ((index % columns) as f64 * SIZE[0], legend_height + (index / columns) as f64 * SIZE[1]);
         let _ = writeln!(out, "<g transform=\"translate({x} {y})\">");
         draw_panel(&mut out, panel);
         out += "</g>\n";
     }
-    out += &legend;
     out += "</svg>\n";
     out
 }
 
-fn legend(panels: &[Panel], width: f64, top: f64) -> (String, f64) {
+/// The legend, and its height: dots first, then lines.
+fn legend(panels: &[Panel], width: f64) -> (String, f64) {
     let mut seen = Vec::new();
-    let (mut out, mut x, mut y) = (String::new(), 12.0, top + 12.0);
-    for series in panels.iter().flat_map(|panel| &panel.series) {
+    let (mut out, mut x, mut y) = (String::new(), 12.0, 14.0);
+    let of = |mark: Mark| panels.iter().flat_map(|panel| &panel.series).filter(move |series| series.mark == mark);
+    for series in of(Mark::Dots).chain(of(Mark::Line)) {
         if series.name.is_empty() || seen.contains(&&series.name) {
             continue;
         }
@@ -98,7 +101,7 @@ fn legend(panels: &[Panel], width: f64, top: f64) -> (String, f64) {
         x += room;
         seen.push(&series.name);
     }
-    (out, y + 8.0 - top)
+    (out, y + 8.0)
 }
 
 /// A logarithmic axis from `low` to `high` on pixels `start` to `end`.
@@ -124,16 +127,16 @@ impl Axis {
         self.start + (self.end - self.start) * (value / self.low).ln() / (self.high / self.low).ln()
     }
 
-    /// Powers of ten, with others between them where there is room.
+    /// Powers of ten, with others between them if these are few.
     fn ticks(&self) -> Vec<f64> {
-        let steps: &[f64] = match self.high / self.low {
-            ..6.0 => &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0],
-            ..60.0 => &[1.0, 2.0, 5.0],
-            _ => &[1.0],
-        };
+        let steps: [&[f64]; 4] = [&[1.0], &[1.0, 3.0], &[1.0, 2.0, 5.0], &[1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0]];
         let decades = self.low.log10().floor() as i32..=self.high.log10().ceil() as i32;
-        let all = decades.flat_map(|decade| steps.iter().map(move |step| step * 10f64.powi(decade)));
-        all.filter(|tick| (self.low..=self.high).contains(tick)).collect()
+        let ticks = |steps: &'static [f64]| -> Vec<f64> {
+            let all = decades.clone().flat_map(|decade| steps.iter().map(move |step| step * 10f64.powi(decade)));
+            all.filter(|tick| (self.low..=self.high).contains(tick)).collect()
+        };
+        let enough = |ticks: &Vec<f64>| ticks.len() > 2;
+        steps.into_iter().map(ticks).find(enough).unwrap_or_else(|| ticks(steps[3]))
     }
 }
 

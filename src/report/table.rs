@@ -96,8 +96,7 @@ pub fn cells(rows: &[Row], seconds_per_sample: Option<f64>) -> (Vec<&'static str
 }
 
 /// A table of fixed-width text.
-pub fn text(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
-    let (headings, cells) = cells(rows, seconds_per_sample);
+pub fn text((headings, cells): &(Vec<&'static str>, Vec<Vec<String>>)) -> String {
     let width = |column: usize| {
         let widths = cells.iter().map(|row| row[column].chars().count());
         widths.chain([headings[column].chars().count()]).max().unwrap_or(0)
@@ -106,14 +105,97 @@ pub fn text(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
     let mut out = String::new();
     let mut line = |cells: &[&str]| {
         let padded = cells.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| match column {
-            0 | 2 => format!("{cell:<width$}"),
+            _ if matches!(headings[column], "data set" | "method" | "planes") => format!("{cell:<width$}"),
             _ => format!("{cell:>width$}"),
         });
         let _ = writeln!(out, "{}", padded.collect::<Vec<_>>().join("  ").trim_end());
     };
-    line(&headings);
+    line(headings);
     cells.iter().for_each(|row| line(&row.iter().map(String::as_str).collect::<Vec<_>>()));
     out
+}
+
+/// What a tolerance gains and costs: headings, and a row of cells for each method that was measured with and without.
+pub fn tolerances(rows: &[Row]) -> (Vec<&'static str>, Vec<Vec<String>>) {
+    let headings = vec![
+        "data set",
+        "spp",
+        "method",
+        "threads",
+        "relMSE",
+        "without",
+        "change",
+        "estimated",
+        "CPU s/Mpx",
+        "without",
+        "time",
+        "settled",
+    ];
+    let cells = rows.iter().filter_map(|row| {
+        let without = row.without_tolerance(rows)?;
+        Some(vec![
+            row.key.data.clone(),
+            row.key.spp.to_string(),
+            row.label.clone(),
+            row.key.threads.to_string(),
+            short(row.relmse()),
+            short(without.relmse()),
+            format!("{:+.2e}", row.relmse() - without.relmse()),
+            format!("{:+.2e}", row.spared.settled_error),
+            spread(&row.cpu, row.repeats),
+            spread(&without.cpu, without.repeats),
+            format!("{:.2} x", row.cpu.median / without.cpu.median),
+            format!("{:.1} %", 100.0 * row.spared.settled),
+        ])
+    });
+    (headings, cells.collect())
+}
+
+/// Names of planes; components that follow each other as `P.0-2`.
+fn runs(planes: &[&str]) -> String {
+    let mut runs: Vec<(&str, &str, &str)> = Vec::new();
+    for plane in planes {
+        let (channel, component) = plane.rsplit_once('.').unwrap_or((plane, ""));
+        let follows = |last: &str| last.parse::<u32>().ok().map(|last| last + 1) == component.parse().ok();
+        match runs.last_mut() {
+            Some((known, _, last)) if *known == channel && !component.is_empty() && follows(last) => *last = component,
+            _ => runs.push((channel, component, component)),
+        }
+    }
+    let names = runs.into_iter().map(|(channel, first, last)| match () {
+        () if first.is_empty() => channel.to_owned(),
+        () if first == last => format!("{channel}.{first}"),
+        () => format!("{channel}.{first}-{last}"),
+    });
+    names.collect::<Vec<_>>().join(", ")
+}
+
+/// What was left out: headings, and a row of cells for each data set and method that left out anything.
+pub fn left_out(rows: &[Row]) -> (Vec<&'static str>, Vec<Vec<String>>) {
+    let mut cells: Vec<Vec<String>> = Vec::new();
+    for row in rows.iter().filter(|row| !row.spared.planes.is_empty()) {
+        let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
+        for (plane, reason) in &row.spared.planes {
+            match reasons.iter_mut().find(|(known, _)| known == reason) {
+                Some((_, planes)) => planes.push(plane),
+                None => reasons.push((reason, vec![plane])),
+            }
+        }
+        let told: Vec<_> = reasons.iter().map(|(reason, planes)| format!("{reason}: {}", runs(planes))).collect();
+        let one = vec![
+            row.key.data.clone(),
+            row.key.spp.to_string(),
+            row.label.clone(),
+            row.spared.work.map_or_else(|| "-".to_owned(), |share| format!("{:.1} %", 100.0 * share)),
+            mebibytes(row.spared.bytes),
+            told.join("; "),
+        ];
+        // Threads change nothing here.
+        if !cells.contains(&one) {
+            cells.push(one);
+        }
+    }
+    (vec!["data set", "spp", "method", "work saved", "planes MiB", "planes"], cells)
 }
 
 /// What the headings of [`cells`] mean.
@@ -130,6 +212,16 @@ pub const NOTES: [&str; 6] = [
      error; plain relMSE: that of as many plain samples as could be rendered in the total time.",
 ];
 
+/// What the headings of [`tolerances`] mean.
+pub const TOLERANCE_NOTE: &str = "settled: pixels that were passed through, since their own samples and those around them say \
+     that filtering can take less than the tolerance off their relMSE; estimated: what that adds to the image's relMSE at \
+     most, on average; change: what it did add, with what other pixels draw from those that were passed through.";
+
+/// What the headings of [`left_out`] mean.
+pub const LEFT_OUT_NOTE: &str = "No bit of a result depends on it. work saved: of the filter's steps, by estimate; columns that are \
+     constant over a neighbourhood only, and differences that weigh nothing, are counted as well. constant: equal in every \
+     sample; missing: no sample has it; unused: the method does not look at it; equal: as an earlier colour plane.";
+
 /// All numbers with all their digits, one row on a line (RFC 4180). Empty is unknown.
 pub fn csv(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
     let columns = COLUMNS.iter().map(|column| column.name);
@@ -140,7 +232,8 @@ pub fn csv(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
         .join(",");
     out += ",relmse_less_own,mse_less_own,own_relmse,own_mse,repeats,cpu_s_per_mpx,cpu_s_per_mpx_min,cpu_s_per_mpx_max,\
             wall_s_per_mpx,wall_s_per_mpx_min,wall_s_per_mpx_max,planned_bytes,peak_resident_bytes,pareto,\
-            unfiltered_slope,slope_is,equal_spp,total_s_per_mpx,plain_s_per_mpx,plain_relmse_at_total\n";
+            unfiltered_slope,slope_is,equal_spp,total_s_per_mpx,plain_s_per_mpx,plain_relmse_at_total,\
+            left_out,left_out_bytes,work_saved,settled,settled_error\n";
     for row in rows {
         let known = |value: Option<f64>| value.map(|value| value.to_string()).unwrap_or_default();
         let mut cells = vec![
@@ -167,6 +260,10 @@ pub fn csv(rows: &[Row], seconds_per_sample: Option<f64>) -> String {
         cells.push(known(seconds_per_sample.map(|seconds| row.cost(seconds))));
         cells.push(known(seconds_per_sample.and_then(|seconds| Some(seconds * row.equal_spp?))));
         cells.push(known(seconds_per_sample.and_then(|seconds| row.plain_relmse(seconds))));
+        let spared = &row.spared;
+        let planes: Vec<_> = spared.planes.iter().map(|(plane, reason)| format!("{plane} {reason}")).collect();
+        cells.extend([quoted(&planes.join("; ")), spared.bytes.to_string(), known(spared.work)]);
+        cells.extend([spared.settled, spared.settled_error].map(|v| v.to_string()));
         out += &cells.join(",");
         out += "\n";
     }
@@ -207,6 +304,11 @@ pub fn json(rows: &[Row], seconds_per_sample: Option<f64>, machine: &Machine) ->
             "cpu_seconds_per_megapixel": spread(row.cpu),
             "wall_seconds_per_megapixel": spread(row.wall),
             "planned_bytes": row.planned,
+            "left_out": row.spared.planes.iter().map(|(plane, reason)| json!({ "plane": plane, "reason": reason })).collect::<Vec<_>>(),
+            "left_out_bytes": row.spared.bytes,
+            "work_saved": row.spared.work,
+            "settled": row.spared.settled,
+            "settled_error": row.spared.settled_error,
             "peak_resident_bytes": row.peak,
             "pareto": row.pareto,
             "unfiltered_slope": { "value": row.slope.value(), "is": slope_is(row.slope) },
@@ -236,6 +338,13 @@ mod tests {
         for (value, expected) in known.into_iter().chain([(1e-7, "1.00e-7"), (f64::NAN, "NaN"), (-0.0123, "-0.0123")]) {
             assert_eq!(short(value), expected);
         }
+    }
+
+    #[test]
+    fn components_that_follow_each_other_are_told_together() {
+        let planes = ["film.0", "film.1", "P.0", "P.2", "time", "a.b", "N.0", "N.1", "N.2"];
+        assert_eq!(runs(&planes), "film.0-1, P.0, P.2, time, a.b, N.0-2");
+        assert_eq!(runs(&[]), "");
     }
 
     #[test]

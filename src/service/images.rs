@@ -29,7 +29,10 @@ use crate::{
     config::Config,
     filter::{ChannelSet, Filtered, Method, Rect, SampleTile},
     stitch::{Added, Claim, Offer, StitchError, Stitcher, digest::digest},
-    wire::{Problem, TileReport, message::ReplacedCounts},
+    wire::{
+        Problem, TileReport,
+        message::{ReplacedCounts, WorkCounts},
+    },
 };
 
 /// Most bytes of the JSON that opens an image.
@@ -220,8 +223,12 @@ impl Image {
             "energy_out": totals.energy_out,
             "filled": totals.filled,
             "unfilled": totals.unfilled,
+            "settled": totals.settled,
+            "settled_error": totals.settled_error,
             "short_of_halo": totals.short_of_halo,
             "halo_needed": [needed.left, needed.top, needed.right, needed.bottom],
+            "left_out_bytes": totals.left_out_bytes,
+            "work": totals.work.map(WorkCounts::from),
         });
         let left_out = stitcher.left_out().iter();
         status["totals"]["left_out"] = left_out

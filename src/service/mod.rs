@@ -206,7 +206,8 @@ impl Service {
             });
         }
         let router = routes::router(Arc::clone(&inner));
-        tracing::info!(%address, memory = %inner.config.memory, threads = inner.config.threads, "listening");
+        let (config, simd) = (&inner.config, inner.config.simd.name());
+        tracing::info!(%address, memory = %config.memory, threads = config.threads, simd, "listening");
         accept(&listener, &router, &stopping, &inner, inner.config.connections, &mut connections, shutdown).await;
         inner.readiness.set(Reason::Draining, true);
         drop(listener);

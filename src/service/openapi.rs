@@ -272,6 +272,7 @@ pub(super) fn document() -> String {
         .schema_from::<TileStatus>()
         .schema_from::<Report>()
         .schema_from::<Replaced>()
+        .schema_from::<Work>()
         .schema_from::<Totals>()
         .schema_from::<LeftOut>()
         .schema_from::<TileLine>()
@@ -411,12 +412,34 @@ schemas! {
         filled: u64,
         /// Pixels without samples that stayed black.
         unfilled: u64,
+        /// Pixels that were passed through, within the tolerance.
+        settled: u64,
+        /// Sum over these of the relMSE that filtering could have taken off at most, by estimate.
+        settled_error: f64,
         /// The halo that it had: left, top, right, bottom, in pixels.
         halo: [u32; 4],
         /// The halo that it would need for the same bits as in the whole image.
         halo_needed: [u32; 4],
         /// Whether the halo was enough.
         exact: bool,
+        /// Bytes of the planes that were not looked at, over the data window.
+        left_out_bytes: u64,
+        /// An estimate of the work; null if the method does not tell.
+        work: Option<Work>,
+    }
+
+    /// An estimate of work, in steps: about the difference of two samples in one column.
+    struct Work {
+        /// Steps done.
+        done: u64,
+        /// Steps left out with whole planes.
+        planes: u64,
+        /// Steps left out for columns that are constant over a neighbourhood.
+        columns: u64,
+        /// Steps left out for differences that weigh nothing.
+        distances: u64,
+        /// The share that was left out, 0 to 1.
+        saved: f64,
     }
 
     /// Values that were not finite and were replaced.
@@ -453,19 +476,27 @@ schemas! {
         filled: u64,
         /// Pixels without samples that stayed black.
         unfilled: u64,
+        /// Pixels that were passed through, within the tolerance.
+        settled: u64,
+        /// Sum over these of the relMSE that filtering could have taken off at most, by estimate.
+        settled_error: f64,
         /// Tiles whose halo was not enough.
         short_of_halo: u64,
         /// The widest halo needed on each side.
         halo_needed: [u32; 4],
         /// Planes that the method did not look at.
         left_out: Vec<LeftOut>,
+        /// Bytes of the planes that were not looked at, over the data window.
+        left_out_bytes: u64,
+        /// An estimate of the work; null if the method does not tell.
+        work: Option<Work>,
     }
 
     /// A plane that tiles did without.
     struct LeftOut {
         /// The plane.
         plane: String,
-        /// `constant`, `missing` or `unused`.
+        /// `constant`, `missing`, `unused` or `equal`.
         reason: String,
         /// How many tiles.
         tiles: u64,

@@ -109,6 +109,7 @@ impl Call {
             pool: Some(pool),
             stop: Some(stop),
             leave_out: self.leave_out,
+            simd: self.service.config.simd,
             ..Execution::default()
         };
         let filtered = filter(&tile, &self.method, &execution).map_err(|_| stopped())?;

@@ -32,7 +32,7 @@ pub use digest::digest;
 pub use exr::{ExrCompression, ExrError, ExrLayout, ExrOptions, ExrSamples, ExrSummary};
 
 use crate::filter::{
-    Coverage, Filtered, LeftOut, Rect, Report, TileGeometry,
+    Coverage, Filtered, LeftOut, Rect, Report, TileGeometry, Work,
     geometry::{GeometryError, Halo},
     samples::Replaced,
 };
@@ -196,10 +196,18 @@ pub struct Totals {
     pub filled: u64,
     /// Pixels without samples that stayed black.
     pub unfilled: u64,
+    /// Pixels that were passed through, within the tolerance.
+    pub settled: u64,
+    /// Sum over these of the relMSE that filtering could have taken off at most, by estimate.
+    pub settled_error: f64,
     /// Tiles that had less halo than the method reads.
     pub short_of_halo: u64,
     /// The widest halo that a tile would have needed, by side.
     pub halo_needed: Halo,
+    /// Bytes of the planes that were left out.
+    pub left_out_bytes: u64,
+    /// How much was done and left out, by estimate, if any tile says so.
+    pub work: Option<Work>,
 }
 
 impl Totals {
@@ -217,6 +225,12 @@ impl Totals {
         self.filled += report.filled;
         self.unfilled += report.unfilled;
         self.short_of_halo += u64::from(!report.exact());
+        self.settled += report.settled;
+        self.settled_error += report.settled_error;
+        self.left_out_bytes += report.left_out_bytes;
+        if let Some(work) = report.work {
+            *self.work.get_or_insert_default() += work;
+        }
         let (widest, needed) = (&mut self.halo_needed, &report.halo_needed);
         widest.left = widest.left.max(needed.left);
         widest.top = widest.top.max(needed.top);

@@ -8,7 +8,7 @@ use std::{
 use serde::{Deserialize, Serialize};
 
 use super::{Format, Problem, VERSION, encoder::write_values};
-use crate::filter::{Filtered, Halo, Method, Rect, Report, samples::Replaced};
+use crate::filter::{Filtered, Halo, Method, Rect, Report, Work, samples::Replaced};
 
 /// Most bytes that the map of a result stream's message may have.
 pub const MAX_MESSAGE: usize = 1 << 20;
@@ -76,6 +76,10 @@ pub struct TileReport {
     pub filled: u64,
     /// Pixels without samples that stayed black.
     pub unfilled: u64,
+    /// Pixels that were passed through, within the tolerance.
+    pub settled: u64,
+    /// Sum over these of the relMSE that filtering could have taken off at most, by estimate.
+    pub settled_error: f64,
     /// The halo that the tile had: left, top, right, bottom, in pixels.
     pub halo: [u32; 4],
     /// The halo that it would need for the same bits as in the whole image.
@@ -84,6 +88,33 @@ pub struct TileReport {
     pub exact: bool,
     /// Planes that the method did not look at, and why.
     pub left_out: Vec<LeftOutPlane>,
+    /// Bytes of these planes over the data window.
+    pub left_out_bytes: u64,
+    /// How much work was done and left out, by estimate; nil if the method does not say.
+    pub work: Option<WorkCounts>,
+}
+
+/// An estimate of work, in steps: [`Work`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct WorkCounts {
+    /// Steps done.
+    pub done: u64,
+    /// Steps left out with whole planes.
+    pub planes: u64,
+    /// Steps left out for columns that are constant over a neighbourhood.
+    pub columns: u64,
+    /// Steps left out for differences that weigh nothing.
+    pub distances: u64,
+    /// The share that was left out, 0 to 1.
+    pub saved: f64,
+}
+
+impl From<Work> for WorkCounts {
+    fn from(work: Work) -> Self {
+        let Work { done, planes, columns, distances } = work;
+        Self { done, planes, columns, distances, saved: work.saved_share() }
+    }
 }
 
 /// Values that were not finite and were replaced, by role.
@@ -105,7 +136,7 @@ pub struct ReplacedCounts {
 pub struct LeftOutPlane {
     /// The plane: its channel's name, with the component's number where there are several (`P.1`).
     pub plane: String,
-    /// `constant`, `missing` or `unused`.
+    /// `constant`, `missing`, `unused` or `equal`.
     pub reason: String,
 }
 
@@ -129,12 +160,16 @@ impl TileReport {
             energy_ratio: ratio.is_finite().then_some(ratio),
             filled: report.filled,
             unfilled: report.unfilled,
+            settled: report.settled,
+            settled_error: report.settled_error,
             halo: sides(report.halo),
             halo_needed: sides(report.halo_needed),
             exact: report.exact(),
             left_out: left_out
                 .map(|l| LeftOutPlane { plane: l.plane.clone(), reason: l.reason.as_str().to_owned() })
                 .collect(),
+            left_out_bytes: report.left_out_bytes,
+            work: report.work.map(WorkCounts::from),
         }
     }
 }

@@ -240,7 +240,7 @@ const fn rect([x, y, width, height]: [u32; 4]) -> Rect {
 mod tests {
     use super::*;
     use crate::{
-        filter::{Filtered, Method, Report},
+        filter::{Filtered, Method, Report, Work},
         wire::message::{encode_end, encode_error, encode_result},
     };
 
@@ -248,7 +248,13 @@ mod tests {
         let core = Rect::new(2, 1, 3, 2);
         let plane = |k: f32| (0..6).map(|i| k + i as f32).collect::<Vec<_>>();
         let rgb = [plane(0.5), plane(-7.0), plane(1e9)];
-        let report = TileReport::new(&Report { samples: 48, ..Report::default() }, &Method::default(), 7, 0.25);
+        let work = Work { done: 60, planes: 30, columns: 9, distances: 1 };
+        let report = TileReport::new(
+            &Report { samples: 48, left_out_bytes: 96, work: Some(work), ..Report::default() },
+            &Method::default(),
+            7,
+            0.25,
+        );
         let filtered = Filtered { core, rgb: rgb.clone(), report: Report::default() };
         let problem = Problem::new(413, "too_large", "Too large", "it is").with("limit", 5);
         let mut out = Vec::new();

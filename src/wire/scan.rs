@@ -83,7 +83,12 @@ pub struct PlaneSummary {
     pub infinite: u64,
     /// Tiles in which it is one constant.
     pub constant_tiles: u64,
+    /// Of all values in their order: planes with the same values have the same, others hardly ever.
+    pub digest: u64,
 }
+
+/// An odd number with its bits well mixed: what a [`PlaneSummary::digest`] is multiplied by with each value.
+const DIGEST: u64 = 0x9E37_79B9_7F4A_7C15;
 
 impl PlaneSummary {
     /// Mean of the finite values, if there are any.
@@ -92,6 +97,15 @@ impl PlaneSummary {
     }
 
     fn add(&mut self, value: f32, times: u64) {
+        // digest x K^n + value x (1 + K + ... + K^(n-1)), with K^n and the sum by doubling n. 0 and -0 are the same.
+        let bits = u64::from((value + 0.0).to_bits()) + 1;
+        let (mut left, mut power, mut sum) = (times, DIGEST, 1_u64);
+        while left > 0 {
+            if left & 1 == 1 {
+                self.digest = self.digest.wrapping_mul(power).wrapping_add(bits.wrapping_mul(sum));
+            }
+            (power, sum, left) = (power.wrapping_mul(power), sum.wrapping_mul(power.wrapping_add(1)), left >> 1);
+        }
         if value.is_finite() {
             self.min = self.min.min(value);
             self.max = self.max.max(value);
@@ -211,6 +225,7 @@ impl Summary {
             nan: 0,
             infinite: 0,
             constant_tiles: 0,
+            digest: 0,
         };
         Self {
             planes: (0..first.channels().planes()).map(plane).collect(),

@@ -17,18 +17,38 @@ fn the_default_preset_denoises() {
     let left_out: Vec<_> =
         report["left_out"].as_array().unwrap().iter().map(|l| l["plane"].as_str().unwrap()).collect();
     assert_eq!(left_out, ["lens.0", "lens.1"]);
+    assert_eq!(report["left_out_bytes"], 2 * 48 * 48 * 4 * 4);
+    let work = |report: &Value, of: &[&str]| of.iter().map(|of| report["work"][of].as_u64().unwrap()).sum::<u64>();
+    let all_of_it = work(&report, &["done", "planes", "columns", "distances"]);
+    let share = work(&report, &["planes", "columns", "distances"]) as f64 / all_of_it as f64;
+    assert!(share > 0.05 && report["work"]["saved"].as_f64().unwrap() == share, "{}", report["work"]);
     let all = folder.path("all.exr");
     let report = json(["filter", input, "-o", &all, "--leave-out", "off"]);
     assert_eq!((&report["leave_out"], &report["left_out"]), (&false.into(), &Value::Array(Vec::new())));
+    assert_eq!((&report["left_out_bytes"], work(&report, &["done"])), (&0.into(), all_of_it));
     assert!(bytes(&all) == bytes(&out));
+    let said = String::from_utf8(rpfd(["filter", input, "-o", &all]).stdout).unwrap();
+    assert!(said.contains("constant: lens.0, lens.1") && said.contains("% of the work"), "{said}");
     assert!(bytes(&png).starts_with(b"\x89PNG"));
+
+    let rough = folder.path("rough.exr");
+    let report = json(["filter", input, "-o", &rough, "--tolerance", "0.1"]);
+    assert_eq!(report["parameters"]["tolerance"], "0.1");
+    let settled = report["settled"].as_u64().unwrap();
+    assert!(settled > 0 && report["settled_error"].as_f64().unwrap() < 0.1 * settled as f64, "{report}");
+    assert!(bytes(&rough) != bytes(&out));
+    let said = String::from_utf8(rpfd(["filter", input, "-o", &rough, "--tolerance", "0.1"]).stdout).unwrap();
+    assert!(said.contains(&format!("{settled} pixels")), "{said}");
+    assert_eq!(fails(2, ["filter", input, "-o", &rough, "--tolerance", "2"]).0, "parameter");
+    assert_eq!(fails(2, ["filter", input, "-o", &rough, "--preset", "gaussian", "--tolerance", "0.1"]).0, "parameter");
 
     let plain = folder.path("plain.exr");
     json(["filter", input, "-o", &plain, "--preset", "unfiltered"]);
     let reference = read_exr(data("small.reference.exr"));
     let error = |path: &str| errors(&read_exr(path).pixels, &reference.pixels).unwrap().relmse;
+    assert!(error(&rough) < error(&out) + 0.1);
     assert!(error(&out) < 0.5 * error(&plain), "{} against {}", error(&out), error(&plain));
-    assert_eq!(folder.names(), ["all.exr", "out.exr", "out.png", "plain.exr"]);
+    assert_eq!(folder.names(), ["all.exr", "out.exr", "out.png", "plain.exr", "rough.exr"]);
 }
 
 /// Bare cores, tiles with halo, one huge tile, shuffled tiles, memory that is plenty or scarce, one thread or two.
@@ -99,6 +119,44 @@ fn less_halo_than_the_preset_reads_is_made_up_for() {
     assert_eq!(report["short_of_halo"], 0);
     json(["filter", &huge, "-o", &b]);
     assert!(bytes(a) == bytes(b));
+}
+
+/// All SIMD levels, asked for by the flag or by the environment, give one file; a level that there is not is refused.
+#[test]
+fn same_bits_at_every_simd_level() {
+    let folder = Folder::new();
+    let (tiles, out) =
+        (folder.synth("in.tiles", &["--size", "40x30", "--spp", "3", "--tile", "64"]), folder.path("out"));
+    let levels = rpfd::filter::SimdLevel::names();
+    let best = *levels.last().unwrap();
+    for preset in ["lean", "paper-fast", "cross-bilateral"] {
+        let filter = ["filter", &tiles, "-o", &out, "--preset", preset];
+        assert_eq!(json(filter)["simd"], best);
+        let expected = bytes(&out);
+        for level in &levels {
+            assert_eq!(json(filter.iter().chain(&["--simd", level]))["simd"], *level);
+            assert!(bytes(&out) == expected, "{preset} at {level}");
+            let mut command = Command::new(env!("CARGO_BIN_EXE_rpfd"));
+            let output = command.args(filter).arg("--json").env("RPFD_SIMD", level).output().unwrap();
+            let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+            assert_eq!(report["simd"], *level);
+            assert!(bytes(&out) == expected, "{preset} at {level}");
+        }
+    }
+    let folder = folder.path("served");
+    for command in [
+        &["filter", &tiles, "-o", &out][..],
+        &["serve", "--listen", "127.0.0.1:0", "--data-dir", &folder],
+        &["report", "--synth", "all@8x8"],
+        &["cost"],
+        &["stability"],
+        &["demo", "--out", &folder],
+    ] {
+        let output = rpfd(command.iter().chain(&["--simd", "avx1024"]));
+        let said = stderr(&output);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains("\"avx1024\"") && said.contains(&levels.join(", ")) && said.contains("auto"), "{said}");
+    }
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! `rpfd inspect`: what it finds.
 
 use super::*;
+use rpfd::filter::{Counts, SampleTile};
 
 fn inspect(path: &str) -> Value {
     json(["inspect", path])
@@ -40,6 +41,47 @@ fn missing_features_halos_and_counts() {
     assert_eq!((&report["samples"]["per_pixel"], &report["samples"]["most"]), (&Value::Null, &4.into()));
     let lean = report["halo_needed"].as_array().unwrap().iter().find(|h| h["preset"] == "lean").unwrap();
     assert_eq!((&lean["needed"], &lean["tiles_with_enough"]), (&20.into(), &6.into()));
+}
+
+/// What `inspect` says will be left out, and what that saves, is what `filter` reports.
+#[test]
+fn a_grey_scene_needs_one_channel() {
+    let folder = Folder::new();
+    let color = folder.synth("color.tiles", &["--size", "40x30", "--spp", "3", "--tile", "32", "--scene", "plain"]);
+    let grey = folder.path("grey.tiles");
+    let (mut file, mut writer) = (TileFile::open(&color).unwrap(), TileWriter::create(&grey).unwrap());
+    while let Some((header, tile)) = file.next_tile().unwrap() {
+        let colors = tile.channels().color_planes();
+        let plane = |plane: usize| tile.plane(if colors.contains(&plane) { colors[0] } else { plane }).clone();
+        let planes = (0..tile.channels().planes()).map(plane).collect();
+        let tile = SampleTile::new(*tile.geometry(), tile.channels().clone(), Counts::Uniform(3), planes).unwrap();
+        writer.write_tile(&header, &tile).unwrap();
+    }
+    writer.finish().unwrap();
+    let saved = |path: &str, preset: &str| {
+        let inspected = json(["inspect", path, "--preset", preset]);
+        let of = |value: &Value, plane: &str, reason: &str| {
+            (value[plane].as_str().map(str::to_owned), value[reason].as_str().map(str::to_owned))
+        };
+        let planes = inspected["planes"].as_array().unwrap().iter().filter(|plane| !plane["left_out"].is_null());
+        let mut planes: Vec<_> = planes.map(|plane| of(plane, "name", "left_out")).collect();
+        let filtered = json(["filter", path, "-o", &folder.path("out.exr"), "--preset", preset]);
+        let left_out = filtered["left_out"].as_array().unwrap().iter();
+        planes.sort();
+        assert_eq!(planes, left_out.map(|l| of(l, "plane", "reason")).collect::<Vec<_>>());
+        assert_eq!(inspected["left_out"]["planes"], planes.len());
+        assert_eq!(inspected["left_out"]["bytes"], planes.len() * 40 * 30 * 3 * 4);
+        (planes.len(), inspected["left_out"]["saved"].as_f64())
+    };
+    for preset in ["lean", "paper-fast"] {
+        let ((all, some), (grey, more)) = (saved(&color, preset), saved(&grey, preset));
+        assert!(grey == all + 2 && more > some, "{preset}: {some:?} {more:?}");
+    }
+    assert_eq!(saved(&grey, "gaussian"), (saved(&color, "gaussian").0, None));
+    let off = json(["inspect", &grey, "--leave-out", "off"]);
+    assert_eq!(off["left_out"], serde_json::json!({ "planes": 0, "bytes": 0, "saved": 0.0 }));
+    let text = String::from_utf8(rpfd(["inspect", &grey]).stdout).unwrap();
+    assert!(text.contains("left out: equal") && text.contains("% of the work of lean"), "{text}");
 }
 
 #[test]

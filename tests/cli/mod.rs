@@ -1,5 +1,6 @@
 //! The `rpfd` command, run as users run it.
 
+mod cost;
 mod demo;
 mod failures;
 mod filter;

@@ -123,14 +123,15 @@ fn what_may_pass_is_sent_again_until_it_works() {
     let report = json(
         post(&url, &out)
             .into_iter()
-            .chain(["--id", "frame", "--seed", "7", "--set", "bins=9", "--half"].map(str::to_owned)),
+            .chain(["--id", "frame", "--seed", "7", "--set", "bins=9", "--half"].map(str::to_owned))
+            .chain(["--leave-out", "off", "--tolerance", "1e-3"].map(str::to_owned)),
     );
     assert_eq!((&report["tiles"], &report["id"]), (&4.into(), &"frame".into()));
     assert_eq!(bytes(&out), b"exr");
     let seen = seen.lock().unwrap();
     let open: Value = serde_json::from_slice(&seen[1].body).unwrap();
     let expected = serde_json::json!({
-        "id": "frame", "width": 48, "height": 48, "preset": "lean", "seed": 7, "bins": "9",
+        "id": "frame", "width": 48, "height": 48, "preset": "lean", "seed": 7, "bins": "9", "tolerance": "1e-3", "leave_out": false,
     });
     assert_eq!(open, expected);
     assert_eq!(seen.iter().filter(|r| r.what.ends_with("tiles")).count(), 8);

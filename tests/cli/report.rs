@@ -125,7 +125,13 @@ fn the_page_needs_nothing_else_and_has_every_row() {
             assert!(!links.contains(outside), "{outside}");
         }
     }
-    assert_eq!(page.matches("<tr class=").count() + page.matches("<tr><td>").count(), 12);
+    let main = page.split("<h2>").find(|part| part.starts_with("Numbers")).unwrap();
+    assert_eq!(main.matches("<tr class=").count() + main.matches("<tr><td>").count(), 12);
+    // What was left out is there with its reason, also in the table and the CSV.
+    let left_out = page.split("<h2>").find(|part| part.starts_with("Left out")).unwrap();
+    for text in [left_out, &String::from_utf8(output.stdout.clone()).unwrap(), &csv] {
+        assert!(text.contains("lens.0") && text.contains("constant"), "{text}");
+    }
     let numbers: Value = serde_json::from_str(&numbers).unwrap();
     let rows = numbers["rows"].as_array().unwrap();
     assert_eq!((rows.len(), csv.lines().count()), (12, 13));
@@ -152,6 +158,36 @@ fn the_page_needs_nothing_else_and_has_every_row() {
         assert!(page.contains(part), "{part}");
     }
     assert_eq!(numbers["machine"]["version"], format!("rpfd {}", env!("CARGO_PKG_VERSION")));
+}
+
+/// What a tolerance saves and costs stands beside what it is without.
+#[test]
+fn tolerances_are_compared_with_none() {
+    let folder = Folder::new();
+    let (small, html) = (small(), folder.path("report.html"));
+    let args = ["report", "--data", &small, "--preset", "lean", "--preset", "lean:bins=9", "--preset", "gaussian"];
+    let more = ["--tolerance", "0.001,0.1", "--html", &html];
+    let report = json(args.iter().chain(&more));
+    let rows = report["rows"].as_array().unwrap();
+    let labels: Vec<_> = rows.iter().map(|row| row["method"].as_str().unwrap()).collect();
+    let lean = ["lean", "lean:tolerance=0.001", "lean:tolerance=0.1"];
+    let nine = ["lean:bins=9", "lean:bins=9,tolerance=0.001", "lean:bins=9,tolerance=0.1"];
+    assert_eq!(labels, [&["unfiltered"][..], &lean, &nine, &["gaussian"]].concat());
+    let number = |row: usize, key: &str| rows[row][key].as_f64().unwrap();
+    for (without, with) in [(1, 3), (4, 6)] {
+        assert_eq!((number(without, "settled"), number(without, "settled_error")), (0.0, 0.0));
+        assert!(number(with, "settled") > 0.0 && number(with, "settled") < 1.0, "{}", number(with, "settled"));
+        // The estimate is of the mean: it holds here with much to spare.
+        let rise = number(with, "relmse_less_own") - number(without, "relmse_less_own");
+        assert!(number(with, "settled_error") < 0.1 * number(with, "settled") && rise < 0.1, "{rise}");
+        assert_ne!(rows[without]["errors"], rows[with]["errors"]);
+        assert!(number(with, "work_saved") > 0.0);
+    }
+    let page = String::from_utf8(bytes(&html)).unwrap();
+    let table = page.split("<h2>").find(|part| part.starts_with("With and without a tolerance")).unwrap();
+    assert_eq!(table.matches("<tr>").count(), 1 + 4);
+    let text = String::from_utf8(rpfd(args.iter().chain(&["--tolerance", "0.1"])).stdout).unwrap();
+    assert!(text.contains("settled: pixels") && text.contains("lean:bins=9,tolerance=0.1"), "{text}");
 }
 
 /// A render in a folder serves its own number of samples, and fewer; what it has not is left out, and said.

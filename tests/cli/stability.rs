@@ -34,6 +34,29 @@ fn the_table_names_the_cause_of_known_failures() {
     assert!(table.contains("0.1 is never too far"), "{table}");
 }
 
+/// With --strict what the published algorithm misses is a failure like any other: the exit code is 1, and what was found
+/// is printed all the same.
+#[test]
+fn what_is_beyond_a_bound_exits_with_1() {
+    let args = ["stability", "--case", "units-alone-1e-3", "--preset", "paper-fast", "--strict"];
+    let (code, message) = fails(1, args);
+    assert_eq!(code, "unstable");
+    assert!(message.contains("1 of 1"), "{message}");
+    let output = rpfd(args.iter().chain(&["--json"]));
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&report["known"], &report["failed"]), (&1.into(), &0.into()));
+    assert!(rpfd(["stability", "--case", "image-1x1", "--preset", "lean", "--strict"]).status.success());
+}
+
+/// What overflows in half precision is infinite when it arrives, and replaced; the film is always in single.
+#[test]
+fn f16_overflows_on_the_wire() {
+    let report = json(["stability", "--case", "f16-overflow", "--preset", "lean"]);
+    let case = &report["cases"][0];
+    // Every 50th of 1024 values from the 11th on, in 3 planes.
+    assert_eq!((&case["replaced"], &case["verdict"]), (&(3 * 21).into(), &"ok".into()));
+}
+
 #[test]
 fn unknown_cases_are_refused_with_what_there_is() {
     let (code, message) = fails(2, ["stability", "--case", "no such"]);

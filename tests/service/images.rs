@@ -64,6 +64,12 @@ fn an_image_says_what_is_missing_until_nothing_is() {
     assert_eq!(status["tiles"][1]["report"]["exact"], json!(false));
     assert!(status["tiles"][0]["report"]["seconds"].as_f64().unwrap() > 0.0);
     assert_eq!((&status["totals"]["tiles"], &status["totals"]["short_of_halo"]), (&json!(2), &json!(1)));
+    let sum =
+        |key: &str| -> u64 { [0, 1].map(|i| status["tiles"][i]["report"]["work"][key].as_u64().unwrap()).iter().sum() };
+    for key in ["done", "planes", "columns", "distances"] {
+        assert_eq!(status["totals"]["work"][key], sum(key), "{key}");
+    }
+    assert!(sum("done") > 0);
     let exr = server.get("/v1/images/a/result.exr?samples=half&compression=piz&layout=tiles&tile=16");
     assert_eq!((exr.status, exr.header("content-type")), (200, Some("image/x-exr")));
     assert_eq!(exr.header("content-length").unwrap(), exr.body.len().to_string());

@@ -2,11 +2,12 @@
 
 mod data;
 
-use super::{failure::Failure, progress};
+use super::{args::SimdArgs, failure::Failure, progress};
 use crate::{
-    filter::{Execution, Method, Rect, SampleTile, method::PRESETS},
+    filter::{Execution, Method, Rect, SampleTile, SimdLevel, method::PRESETS},
     picture::PictureError,
     report::{
+        cost::{self, Costs},
         html::{Page, page},
         machine::Machine,
         measure::{MeasureError, Measurement, measure, middle},
@@ -60,12 +61,17 @@ pub(crate) struct Args {
     /// --crop
     #[arg(long = "preset", value_name = "NAME[:K=V,...]")]
     presets: Vec<String>,
+    /// Measure each method that has a tolerance with these as well (lean:tolerance=1e-3), and compare
+    #[arg(long, value_name = "E,...", value_delimiter = ',')]
+    tolerance: Vec<String>,
     /// Samples per pixel; by default as many as the files have, and 8 of --synth
     #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=65535))]
     spp: Vec<u32>,
     /// Threads to filter on
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "1", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Vec<u32>,
+    #[command(flatten)]
+    simd: SimdArgs,
     /// Measure each so often; times are medians
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeats: u32,
@@ -77,6 +83,9 @@ pub(crate) struct Args {
     /// together, and of the plain samples of equal error
     #[arg(long, value_name = "S", value_parser = seconds)]
     seconds_per_sample: Option<f64>,
+    /// What `rpfd cost --json FILE` has measured: adds its plots to the page
+    #[arg(long, value_name = "FILE", requires = "html")]
+    cost: Option<PathBuf>,
     /// Keys every random draw of the methods and of --synth
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -118,13 +127,13 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 /// A method and what it is called.
-struct Named {
-    label: String,
-    method: Method,
+pub(super) struct Named {
+    pub(super) label: String,
+    pub(super) method: Method,
 }
 
 /// Reads `NAME:k=v,k=v`; what has no `=` goes on with the value before it.
-fn named(text: &str) -> Result<Named, Failure> {
+pub(super) fn named(text: &str) -> Result<Named, Failure> {
     let (preset, settings) = text.split_once(':').unwrap_or((text, ""));
     let mut pairs: Vec<(&str, String)> = Vec::new();
     for part in settings.split(',').filter(|part| !part.is_empty()) {
@@ -150,8 +159,17 @@ impl Args {
         };
         let mut methods = vec![named(BASE)?];
         for text in wanted {
-            if !methods.iter().any(|known| known.label == text) {
-                methods.push(named(&text)?);
+            let method = named(&text)?;
+            let has = method.method.parameters().iter().any(|(name, _)| *name == "tolerance");
+            let tolerances = self.tolerance.iter().filter(|_| has).map(|e| {
+                let comma = if text.contains(':') { ',' } else { ':' };
+                named(&format!("{text}{comma}tolerance={e}"))
+            });
+            for method in [Ok(method)].into_iter().chain(tolerances) {
+                let method = method?;
+                if !methods.iter().any(|known| known.label == method.label) {
+                    methods.push(method);
+                }
             }
         }
         Ok(methods)
@@ -190,6 +208,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::usage("no_data", "nothing to measure: give --data, --folder or --synth"));
     }
     let methods = args.methods()?;
+    let cost = args.cost.as_deref().map(read_cost).transpose()?;
     let outputs = args.outputs()?;
     let mut state = match &args.state {
         Some(path) => State::open(path).map_err(|error| state_failure(path, &error))?,
@@ -224,7 +243,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             references.insert(job.key.data.clone(), picture);
         }
     }
-    write(args, &rows, &references, outputs)
+    write(args, &rows, &references, cost.as_ref(), outputs)
+}
+
+/// What `rpfd cost` has written.
+fn read_cost(path: &Path) -> Result<Costs, Failure> {
+    let fail = |code, error: &dyn std::fmt::Display| Failure::input(code, format!("{}: {error}", path.display()));
+    let text = std::fs::read_to_string(path).map_err(|error| fail("io", &error))?;
+    cost::show::from_json(&text)
+        .map_err(|error| fail("bad_json", &format!("not what rpfd cost --json writes: {error}")))
 }
 
 fn state_failure(path: &Path, error: &std::io::Error) -> Failure {
@@ -238,6 +265,7 @@ fn state_failure(path: &Path, error: &std::io::Error) -> Failure {
 /// Everything that is to be measured, in the order of the report.
 fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Failure> {
     let mut jobs = Vec::new();
+    let version = Machine::build();
     for (index, set) in sets.iter().enumerate() {
         let image = Rect::new(0, 0, set.image[0], set.image[1]);
         if let Some(part) = args.crop.filter(|part| image.intersection(part) != Some(*part)) {
@@ -267,9 +295,10 @@ fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Fa
                         preset: named.method.preset_name().to_owned(),
                         parameters: Key::parameters_of(&named.method),
                         threads: threads as usize,
+                        simd: args.simd.level.name().to_owned(),
                         seed: args.seed,
                         repeat,
-                        version: env!("CARGO_PKG_VERSION").to_owned(),
+                        version: version.clone(),
                     };
                     let keys = args.threads.iter().flat_map(|&t| (0..args.repeats).map(move |r| (t, r)));
                     let job = |(t, r)| Job { set: index, source, part, method: number, key: key(t, r) };
@@ -345,7 +374,7 @@ fn measure_all(
             continue;
         }
         let (tile, reference) = loaded.of(job, &sets[job.set], stop)?;
-        let measurement = one(job, methods, tile, reference, (&pools, stop), (&bar, position))?;
+        let measurement = one(job, methods, tile, reference, (&pools, args.simd.level, stop), (&bar, position))?;
         let add = state.add(job.key.clone(), measurement);
         add.map_err(|error| Failure::failed("output_io", format!("the state file: {error}")))?;
     }
@@ -358,7 +387,7 @@ fn one(
     methods: &[Named],
     tile: &SampleTile,
     reference: &[[f32; 3]],
-    (pools, stop): (&BTreeMap<usize, Option<rayon::ThreadPool>>, &AtomicBool),
+    (pools, simd, stop): (&BTreeMap<usize, Option<rayon::ThreadPool>>, SimdLevel, &AtomicBool),
     (bar, position): (&ProgressBar, u64),
 ) -> Result<Measurement, Failure> {
     let report = |share: f32| bar.set_position(position + (share * STEPS as f32) as u64);
@@ -367,6 +396,7 @@ fn one(
         pool: pools.get(&job.key.threads).and_then(Option::as_ref),
         stop: Some(stop),
         progress: Some(&report),
+        simd,
         ..Execution::default()
     };
     let mut measurement = measure(tile, reference, &methods[job.method].method, &execution)?;
@@ -380,11 +410,12 @@ fn write(
     args: &Args,
     rows: &[Row],
     references: &BTreeMap<String, String>,
+    cost: Option<&Costs>,
     outputs: [Option<AtomicFile>; 4],
 ) -> Result<(), Failure> {
-    let (machine, seconds_per_sample) = (Machine::here(), args.seconds_per_sample);
+    let (machine, seconds_per_sample) = (Machine::here(args.simd.level), args.seconds_per_sample);
     let json = || format!("{:#}\n", table::json(rows, seconds_per_sample, &machine));
-    let html = || page(&Page { rows, references, machine: &machine, seconds_per_sample });
+    let html = || page(&Page { rows, references, machine: &machine, seconds_per_sample, cost });
     // Whole images where there are such.
     let plotted: Vec<Row> =
         rows.iter().filter(|row| !row.key.part || rows.iter().all(|row| row.key.part)).cloned().collect();
@@ -402,9 +433,13 @@ fn write(
     }
     let Machine { cpu, cores, simd, os, version } = &machine;
     println!("{version} on {cpu}, {cores} processors, SIMD {simd}, {os}\n");
-    print!("{}", table::text(rows, seconds_per_sample));
+    print!("{}", table::text(&table::cells(rows, seconds_per_sample)));
     let notes = &table::NOTES[..if seconds_per_sample.is_some() { 6 } else { 5 }];
     println!("\n{}", notes.join("\n"));
+    let tables = [(table::tolerances(rows), table::TOLERANCE_NOTE), (table::left_out(rows), table::LEFT_OUT_NOTE)];
+    for (table, note) in tables.iter().filter(|((_, cells), _)| !cells.is_empty()) {
+        println!("\n{}\n{note}", table::text(table));
+    }
     let unlike = rows.iter().filter(|row| !row.repeatable);
     unlike.for_each(|row| println!("NOT REPEATABLE: the errors of {} on {} differ", row.label, row.key.data));
     for path in [&args.csv, &args.html, &args.svg].into_iter().flatten() {

@@ -11,17 +11,14 @@ pub(crate) fn mean(values: impl ExactSizeIterator<Item = f32>) -> f64 {
 /// Every core pixel's mean; a pixel without samples is black.
 pub(crate) fn filter(tile: &SampleTile, execution: &Execution) -> Result<Filtered, Stopped> {
     let (core, window) = (tile.geometry().core(), tile.geometry().window());
-    let mut report = Report {
-        replaced: tile.replaced(),
-        halo: tile.geometry().halo(),
-        left_out: tile
-            .channels()
-            .planes_of(|role| *role != Role::Color)
-            .into_iter()
-            .map(|plane| LeftOut { plane: tile.channels().plane_name(plane), reason: LeftOutReason::Unused })
-            .collect(),
-        ..Report::default()
-    };
+    let left_out = tile
+        .channels()
+        .planes_of(|role| *role != Role::Color)
+        .into_iter()
+        .map(|plane| LeftOut { plane: tile.channels().plane_name(plane), reason: LeftOutReason::Unused })
+        .collect();
+    let report = Report { replaced: tile.replaced(), halo: tile.geometry().halo(), ..Report::default() };
+    let mut report = report.leaving_out(left_out, tile);
     let color = tile.channels().color_planes();
     let mut rgb = color.map(|_| Vec::with_capacity(core.area() as usize));
     for y in core.y..core.bottom() {

@@ -165,9 +165,9 @@ pub(crate) fn filter<W: Windowed>(tile: &SampleTile, method: &W, execution: &Exe
         replaced: tile.replaced(),
         halo: tile.geometry().halo(),
         halo_needed: tile.geometry().halo_for(space.reach(tile.varying())),
-        left_out,
         ..Report::default()
     };
+    let report = report.leaving_out(left_out, tile);
     let pixel = |x, y| {
         let counts = !tile.samples_of(layout.window.index(x, y)).is_empty();
         counts.then(|| std::array::from_fn(|k| f64::from(filtered[3 * region.index(x, y) + k])))

@@ -2,7 +2,7 @@
 //!
 //! Every plane is computed with, constant or not: that leaving planes out changes nothing is the fast path's claim.
 
-use super::super::rpf::{Params, draws, region};
+use super::super::rpf::{Offsets, Params, draws, region};
 use super::super::{Rect, Role, SampleTile};
 use super::{Cluster, Columns, Weights, bin, deviation, filter, mean, normalise, pixel, tame_spikes, weigh};
 use std::collections::HashMap;
@@ -14,6 +14,9 @@ const NEAR_CLUSTER: f64 = 1e-9;
 /// Within this of the spike limit, relative to the pixel's size, a sample may be a spike or not in f32.
 const NEAR_SPIKE: f64 = 1e-5;
 
+/// Errors of pixels are computed in f64 by both, too.
+const NEAR_SETTLED: f64 = 1e-9;
+
 /// Colours R, G, B.
 type Color = [f64; 3];
 
@@ -22,6 +25,8 @@ pub struct Whole<'a> {
     tile: &'a SampleTile,
     params: &'a Params,
     seed: u64,
+    /// Of each iteration.
+    offsets: Vec<Offsets>,
     film: Vec<usize>,
     random: Vec<usize>,
     /// Planes, and how many deviations a candidate may be off.
@@ -59,7 +64,8 @@ impl<'a> Whole<'a> {
         let features = features.collect();
         let film = planes(|role| matches!(role, Role::Film));
         let random = planes(|role| matches!(role, Role::Random { .. }));
-        Self { tile, params, seed, film, random, features }
+        let offsets = params.boxes.iter().map(|&width| Offsets::new(width)).collect();
+        Self { tile, params, seed, offsets, film, random, features }
     }
 
     /// The colours before the first iteration.
@@ -101,7 +107,7 @@ impl<'a> Whole<'a> {
         });
         let clusters: Vec<_> = clusters.collect();
         let mut found = Neighbourhood { pixels: vec![pixel; own.len()], rows: own, near: 0 };
-        for (pixel, sample) in draws(self.tile, self.params, self.seed, t, x, y) {
+        for (pixel, sample) in draws(&self.offsets[t], self.tile, self.params, self.seed, t, x, y) {
             let mut accepted = true;
             for (plane, cluster) in &clusters {
                 let (inside, margin) = cluster.accepts(f64::from(self.tile.value(*plane, sample)));
@@ -185,6 +191,37 @@ impl<'a> Whole<'a> {
         Some((Weights { alpha, beta, color_on_random: 1.0 - (confidence / total).sqrt() }, near))
     }
 
+    /// Whether a pixel is passed through: its mean, and those of the pixels around it, are good enough by themselves. And
+    /// how many of these decisions were near.
+    fn settled(&self, x: u32, y: u32) -> (bool, u32) {
+        let tolerance = self.params.tolerance;
+        if tolerance == 0.0 {
+            return (false, 0);
+        }
+        let window = self.tile.geometry().window();
+        let (mut settled, mut near) = (true, 0);
+        for y in y.saturating_sub(1)..=y + 1 {
+            for x in x.saturating_sub(1)..=x + 1 {
+                let own = if window.contains(x, y) { self.tile.samples_of(window.index(x, y)) } else { 0..0 };
+                let error = match own.len() {
+                    0 => 0.0,
+                    1 => f64::INFINITY,
+                    n => {
+                        let of = |plane: &usize| {
+                            let values = self.plane(*plane, &own.clone().collect::<Vec<_>>());
+                            // The variance with n - 1, of the mean, relative.
+                            deviation(&values).powi(2) / (n as f64 - 1.0) / (mean(&values).powi(2) + 0.01)
+                        };
+                        mean(&self.tile.channels().color_planes().iter().map(of).collect::<Vec<_>>())
+                    }
+                };
+                settled &= error < tolerance;
+                near += u32::from((error - tolerance).abs() < NEAR_SETTLED * tolerance);
+            }
+        }
+        (settled, near)
+    }
+
     /// Iteration `t` from these colours.
     pub fn step(&self, t: usize, colors: &[Color]) -> Step {
         let (window, region) = (self.tile.geometry().window(), self.region(t));
@@ -195,6 +232,13 @@ impl<'a> Whole<'a> {
             for x in region.x..region.right() {
                 let at = window.index(x, y);
                 let own = self.tile.samples_of(at);
+                let (settled, near_settled) = self.settled(x, y);
+                if settled {
+                    let absolute = |k: usize| own.clone().map(|s| colors[s][k].abs()).collect::<Vec<_>>();
+                    step.size[at] = [0, 1, 2].map(|k| if own.is_empty() { 0.0 } else { mean(&absolute(k)) });
+                    step.near[at] = near_settled;
+                    continue;
+                }
                 let Some((weights, near)) = self.weights(t, x, y, colors, &mut nodes) else { continue };
                 if own.is_empty() {
                     continue;
@@ -215,7 +259,7 @@ impl<'a> Whole<'a> {
                 } else {
                     out.clone()
                 };
-                step.near[at] = near + around.near;
+                step.near[at] = near + around.near + near_settled;
                 step.size[at] = std::array::from_fn(|k| {
                     let greatest = absolute[k].iter().copied().fold(0.0, f64::max);
                     mean(&size.iter().map(|c| c[k]).collect::<Vec<_>>()) + (-80.0_f64).exp() * greatest

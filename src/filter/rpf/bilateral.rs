@@ -12,12 +12,14 @@ pub(crate) struct Distances<'a> {
     pub(crate) columns: &'a [f32],
     /// Values between the starts of two columns.
     pub(crate) stride: usize,
-    /// Which columns count.
+    /// Which columns count; the colours at the end, one that equals another as that other once more.
     pub(crate) active: &'a [usize],
     /// The three colour channels, laid out like `columns`, scaled by their [`Span::scale`].
     pub(crate) radiance: &'a [f32],
     /// What each colour channel spans.
     pub(crate) spans: &'a [Span; 3],
+    /// Of each colour channel the first that has the same values: of the others nothing is read.
+    pub(crate) twins: &'a [usize; 3],
     /// Rows.
     pub(crate) rows: usize,
 }
@@ -28,40 +30,64 @@ const BLOCK: usize = 4;
 /// Filters the first samples of the neighbourhood, as many as `out` has triples (R, G, B next to each other).
 #[inline(always)]
 pub(crate) fn filter<S: Simd>(simd: S, distances: &Distances, out: &mut [f32]) {
+    match distances.twins {
+        [0, 0, 0] => filter_channels::<S, 1>(simd, distances, out),
+        _ => filter_channels::<S, 3>(simd, distances, out),
+    }
+}
+
+/// Filters `C` colour channels: all, or only the first, with which the others are equal.
+#[inline(always)]
+fn filter_channels<S: Simd, const C: usize>(simd: S, distances: &Distances, out: &mut [f32]) {
     let mut first = 0;
     let mut blocks = out.chunks_exact_mut(3 * BLOCK);
     for block in &mut blocks {
-        filter_block::<S, BLOCK>(simd, distances, first, block);
+        filter_block::<S, BLOCK, C>(simd, distances, first, block);
         first += BLOCK;
     }
     for single in blocks.into_remainder().chunks_exact_mut(3) {
-        filter_block::<S, 1>(simd, distances, first, single);
+        filter_block::<S, 1, C>(simd, distances, first, single);
         first += 1;
     }
 }
 
 /// Filters `N` samples, from `first` on. Each sample's sums run in the same order whatever the block.
 #[inline(always)]
-fn filter_block<S: Simd, const N: usize>(simd: S, distances: &Distances, first: usize, out: &mut [f32]) {
-    let Distances { columns, stride, active, radiance, spans, rows } = *distances;
+fn filter_block<S: Simd, const N: usize, const C: usize>(
+    simd: S,
+    distances: &Distances,
+    first: usize,
+    out: &mut [f32],
+) {
+    let Distances { columns, stride, active, radiance, spans, twins, rows } = *distances;
     let zero = Lanes::splat(simd, 0.0);
-    let (mut weights, mut sums) = ([zero; N], [[zero; 3]; N]);
+    let (mut weights, mut sums) = ([zero; N], [[zero; C]; N]);
+    // Of one channel the last column's squares are added as often as it is there, which gives the bits of adding each.
+    let again = if C == 1 { active.windows(2).filter(|pair| pair[0] == pair[1]).count() } else { 0 };
     for start in (0..rows).step_by(LANES) {
-        let mut distance = [zero; N];
-        for &column in active {
+        let (mut distance, mut squares) = ([zero; N], [zero; N]);
+        for &column in &active[..active.len() - again] {
             let column = &columns[column * stride..][..stride];
             let values = Lanes::from_slice(simd, &column[start..start + LANES]);
-            for (distance, &own) in distance.iter_mut().zip(&column[first..first + N]) {
+            for (n, &own) in column[first..first + N].iter().enumerate() {
                 let difference = values - Lanes::splat(simd, own);
-                *distance += difference * difference;
+                squares[n] = difference * difference;
+                distance[n] += squares[n];
             }
         }
-        let colors: [Lanes<S>; 3] =
-            std::array::from_fn(|k| Lanes::from_slice(simd, &radiance[k * stride + start..][..LANES]));
+        for _ in 0..again {
+            for n in 0..N {
+                distance[n] += squares[n];
+            }
+        }
+        let mut colors = [zero; C];
+        for (k, color) in colors.iter_mut().enumerate() {
+            *color = Lanes::from_slice(simd, &radiance[twins[k] * stride + start..][..LANES]);
+        }
         for n in 0..N {
             let weight = keep_first(simd, exp_neg(simd, distance[n]), rows - start);
             weights[n] += weight;
-            for k in 0..3 {
+            for k in 0..C {
                 sums[n][k] += weight * colors[k];
             }
         }
@@ -69,9 +95,9 @@ fn filter_block<S: Simd, const N: usize>(simd: S, distances: &Distances, first: 
     for (n, out) in out.chunks_exact_mut(3).enumerate() {
         let weight = sum(weights[n]);
         for k in 0..3 {
-            let Span { min, max, scale } = spans[k];
+            let Span { min, max, scale, .. } = spans[k];
             // The mean lies between the least and the greatest value; rounding must not take it out, nor to infinity.
-            let mean = (sum(sums[n][k]) / weight).max(min * scale).min(max * scale);
+            let mean = (sum(sums[n][k % C]) / weight).max(min * scale).min(max * scale);
             // What underflows to -0 becomes 0.
             out[k] = mean / scale + 0.0;
         }

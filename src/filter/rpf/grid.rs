@@ -44,32 +44,46 @@ impl Grid {
         (columns * rows * (FIXED + features) * size_of::<f32>()) as u64
     }
 
-    /// Image position of a node, along one axis of an image of this size.
-    const fn position(&self, node: u32, size: u32) -> u32 {
-        let position = node as u64 * self.spacing as u64;
-        if position >= size as u64 { size - 1 } else { position as u32 }
+    /// The nodes' numbers in x and y from the first.
+    pub(crate) const fn nodes(&self) -> Rect {
+        Rect::new(0, 0, self.size[0] as u32, self.size[1] as u32)
     }
 
-    /// The node rows, each with its number, to be computed one by one.
-    pub(crate) fn rows(&mut self) -> (GridRows, impl Iterator<Item = (usize, &mut [f32])>) {
-        let rows = GridRows {
-            columns: (0..self.size[0] as u32).map(|i| self.position(self.first[0] + i, self.image.width)).collect(),
-            rows: (0..self.size[1] as u32).map(|i| self.position(self.first[1] + i, self.image.height)).collect(),
-            values: FIXED + self.features,
-        };
-        let length = self.size[0] * rows.values;
-        (rows, self.nodes.chunks_exact_mut(length).enumerate())
+    /// Values per node.
+    pub(crate) const fn values(&self) -> usize {
+        FIXED + self.features
+    }
+
+    /// All nodes, to be computed: [`Grid::values`] of each, row by row.
+    pub(crate) fn all(&mut self) -> &mut [f32] {
+        &mut self.nodes
+    }
+
+    /// Where nodes lie, without being computed yet.
+    pub(crate) const fn places(&self) -> Places {
+        Places { spacing: self.spacing, image: self.image, first: self.first }
+    }
+
+    /// Whether all nodes around the pixels of a part of the region have weights.
+    pub(crate) fn complete(&self, pixels: &Rect) -> bool {
+        let last = |end: u32| (end - 1).div_ceil(self.spacing);
+        let columns =
+            (pixels.x / self.spacing - self.first[0]) as usize..=(last(pixels.right()) - self.first[0]) as usize;
+        (pixels.y / self.spacing..=last(pixels.bottom())).all(|y| {
+            let row = (y - self.first[1]) as usize * self.size[0];
+            columns.clone().all(|x| !self.nodes[(row + x) * self.values() + 3].is_nan())
+        })
     }
 
     /// Weights at a pixel of the region; false if none of the nodes around it has any.
     pub(crate) fn interpolate(&self, x: u32, y: u32, weights: &mut Weights) -> bool {
         let axis = |pixel: u32, size: u32| {
             let node = pixel / self.spacing;
-            let (low, high) = (self.position(node, size), self.position(node + 1, size));
+            let (low, high) = (position(self.spacing, node, size), position(self.spacing, node + 1, size));
             let high_share = if high == low { 0.0 } else { (pixel - low) as f32 / (high - low) as f32 };
             [(node, 1.0 - high_share), (node + 1, high_share)]
         };
-        let width = FIXED + self.features;
+        let width = self.values();
         let mut total = 0.0;
         weights.color = [0.0; 3];
         weights.confidence = 0.0;
@@ -104,26 +118,61 @@ impl Grid {
     }
 }
 
-/// Where the nodes lie.
-pub(crate) struct GridRows {
-    columns: Vec<u32>,
-    rows: Vec<u32>,
-    values: usize,
+/// Where the nodes of a grid lie.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Places {
+    spacing: u32,
+    image: Rect,
+    first: [u32; 2],
 }
 
-impl GridRows {
-    /// Computes the weights of one row of nodes.
+impl Places {
+    /// Image position of a node, by its number from the first.
+    fn of(&self, column: u32, row: u32) -> (u32, u32) {
+        let at = |node, size| position(self.spacing, node, size);
+        (at(self.first[0] + column, self.image.width), at(self.first[1] + row, self.image.height))
+    }
+
+    /// Whether any pixel that the weights of a node are interpolated for is filtered at all.
+    fn needed(&self, pass: &Pass, x: u32, y: u32) -> bool {
+        let around = Rect::new(x, y, 1, 1).grown(self.spacing - 1, &pass.tile.geometry().window());
+        let mut rows = around.y..around.bottom();
+        pass.settled.is_empty() || rows.any(|y| (around.x..around.right()).any(|x| !pass.settled(x, y)))
+    }
+
+    /// Computes the weights of a block of nodes, numbered from the first; `rows` holds the values of each of its rows.
     #[inline(always)]
-    pub(crate) fn weigh<S: Simd>(&self, simd: S, pass: &Pass, scratch: &mut Scratch, row: usize, nodes: &mut [f32]) {
-        let y = self.rows[row];
+    pub(crate) fn weigh<S: Simd>(
+        &self,
+        simd: S,
+        pass: &Pass,
+        scratch: &mut Scratch,
+        nodes: &Rect,
+        rows: Vec<&mut [f32]>,
+    ) {
         let window = pass.tile.geometry().window();
-        for (&x, node) in self.columns.iter().zip(nodes.chunks_exact_mut(self.values)) {
-            if !pass.execution.stopped() && window.contains(x, y) && pass.weigh(simd, scratch, x, y) {
-                let Weights { color, features, confidence } = &scratch.weights;
-                node[..3].copy_from_slice(color);
-                node[3] = *confidence;
-                node[FIXED..].copy_from_slice(features);
+        let (x, y) = self.of(nodes.x, nodes.y);
+        let (right, bottom) = self.of(nodes.right() - 1, nodes.bottom() - 1);
+        let Some(pixels) = Rect::new(x, y, right - x + 1, bottom - y + 1).intersection(&window) else { return };
+        pass.load(simd, scratch, &pixels, true);
+        for (row, values) in (nodes.y..).zip(rows) {
+            let length = values.len() / nodes.width as usize;
+            for (column, node) in (nodes.x..).zip(values.chunks_exact_mut(length)) {
+                let (x, y) = self.of(column, row);
+                let here = !pass.execution.stopped() && pixels.contains(x, y) && self.needed(pass, x, y);
+                if here && pass.weigh(simd, scratch, x, y) {
+                    let Weights { color, features, confidence } = &scratch.weights;
+                    node[..3].copy_from_slice(color);
+                    node[3] = *confidence;
+                    node[FIXED..].copy_from_slice(features);
+                }
             }
         }
     }
+}
+
+/// Image position of a node, along one axis of an image of this size.
+const fn position(spacing: u32, node: u32, size: u32) -> u32 {
+    let position = node as u64 * spacing as u64;
+    if position >= size as u64 { size - 1 } else { position as u32 }
 }

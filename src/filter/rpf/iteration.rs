@@ -1,15 +1,17 @@
 //! One pass over the tile: each pixel's neighbourhood gathered once, weighed, and its samples filtered.
 
 use super::bilateral::{self, Distances};
+use super::block::{Block, ColumnOrder};
+use super::cluster::Cluster;
 use super::information::Histograms;
-use super::neighborhood::{Center, Clustering, Offsets, Rows, gather_rows};
+use super::neighborhood::{Center, Offsets, gather_rows};
 use super::params::Params;
-use super::relevance::{Relevant, Source};
-use super::statistics::{Span, impute, normalise, pad, span};
+use super::relevance::Relevant;
+use super::statistics::{Span, impute, make_safe, normalise};
 use super::weights::{Dependencies, Weights, steepness};
-use super::{grid::Grid, random, spikes};
+use super::{grid::Grid, random, spikes, work::Columns};
 use crate::filter::lanes::{Simd, padded};
-use crate::filter::{Execution, Plane, Rect, SampleTile};
+use crate::filter::{Execution, Rect, SampleTile, Work};
 
 /// All that a pass reads.
 pub(crate) struct Pass<'a> {
@@ -23,211 +25,301 @@ pub(crate) struct Pass<'a> {
     pub(crate) offsets: Offsets,
     /// n ln n.
     pub(crate) terms: &'a [f64],
+    /// Of each pixel of the data window whether it is passed through; may be empty.
+    pub(crate) settled: &'a [bool],
     /// Colours after the iteration before: R, G, B of each sample next to each other.
     pub(crate) colors: &'a [f32],
 }
 
+/// The greatest of what one thread works on at a time.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Room {
+    /// Pixels of a block, with all around it that its neighbourhoods reach.
+    pub(crate) pixels: usize,
+    /// Samples of these.
+    pub(crate) samples: usize,
+    /// Rows of a neighbourhood.
+    pub(crate) rows: usize,
+}
+
 /// What one thread works in; allocated once per tile, with [`Scratch::bytes`].
 pub(crate) struct Scratch {
-    pub(super) rows: Rows,
-    /// Columns of the neighbourhood, `stride` apart: positions, random parameters, features, colours.
-    pub(super) columns: Vec<f32>,
-    pub(super) radiance: Vec<f32>,
-    pub(super) stride: usize,
+    /// The samples around the pixels that are worked on.
+    pub(super) block: Block,
+    cluster: Cluster,
+    /// The neighbourhood: the first `count` are records of the block, the rest fills up whole lanes.
+    rows: Vec<u32>,
+    pub(super) count: usize,
+    order: ColumnOrder,
+    /// Columns of the neighbourhood, `stride` values apart.
+    columns: Vec<f32>,
+    radiance: Vec<f32>,
+    stride: usize,
+    /// Whether each column is constant.
+    constant: Vec<bool>,
     histograms: Histograms,
     pub(super) dependencies: Dependencies,
     pub(crate) weights: Weights,
-    active: Vec<usize>,
+    /// The columns that weigh anything, and their factors.
+    pub(super) active: Vec<usize>,
+    factors: Vec<f32>,
+    /// What was done and left out in core pixels.
+    pub(super) work: Work,
     /// Values that the spike step replaced in core pixels.
     pub(crate) spikes: u64,
 }
 
-/// Where the columns of a role start, in [`Scratch::columns`].
-pub(super) struct ColumnOrder {
-    pub(super) random: usize,
-    pub(super) features: usize,
-    pub(super) colors: usize,
-    pub(super) end: usize,
-}
-
-impl ColumnOrder {
-    pub(super) fn of(relevant: &Relevant) -> Self {
-        let random = relevant.positions().len();
-        let features = random + relevant.random().len();
-        let colors = features + relevant.features().len();
-        Self { random, features, colors, end: colors + 3 }
-    }
-}
-
 impl Scratch {
-    /// Room for neighbourhoods of so many rows.
-    pub(crate) fn new(relevant: &Relevant, rows: usize, bins: u32, leave_out: bool) -> Self {
-        let columns = ColumnOrder::of(relevant).end;
-        let stride = padded(rows);
+    /// Room for one thread.
+    pub(crate) fn new(tile: &SampleTile, relevant: &Relevant, params: &Params, room: &Room, leave_out: bool) -> Self {
+        let order = ColumnOrder::of(relevant);
+        let (stride, columns, features) = (padded(room.rows), order.columns(), relevant.features());
         Self {
-            rows: Rows::with_capacity(rows),
+            block: Block::with_capacity(room.pixels, room.samples, tile, &order),
+            cluster: Cluster::new(features, params),
+            rows: vec![0; stride],
+            count: 0,
             columns: vec![0.0; columns * stride],
             radiance: vec![0.0; 3 * stride],
             stride,
-            histograms: Histograms::with_capacity(columns, stride, bins, leave_out),
-            dependencies: Dependencies::new(relevant.features().len()),
-            weights: Weights::new(relevant.features().len()),
-            active: Vec::with_capacity(columns),
+            constant: vec![true; columns],
+            histograms: Histograms::with_capacity(columns, stride, params.bins, leave_out),
+            dependencies: Dependencies::new(features.len()),
+            weights: Weights::new(features.len()),
+            active: Vec::with_capacity(features.len() + 3),
+            factors: Vec::with_capacity(features.len() + 3),
+            work: Work::default(),
             spikes: 0,
+            order,
         }
     }
 
-    /// Bytes that [`Scratch::new`] allocates for so many columns, features among them, and rows.
-    pub(crate) const fn bytes(columns: usize, features: usize, rows: usize, bins: u32) -> u64 {
-        let stride = padded(rows);
-        let values = rows * 2 * size_of::<u32>() + (columns + 3) * stride * size_of::<f32>();
-        let small = features * (3 * size_of::<f64>() + size_of::<f32>()) + columns * size_of::<usize>();
-        (values + small) as u64 + Histograms::bytes(columns, stride, bins)
+    /// Bytes that [`Scratch::new`] allocates.
+    pub(crate) fn bytes(order: &ColumnOrder, room: &Room, varying: bool, bins: u32) -> u64 {
+        let (stride, columns, features) = (padded(room.rows), order.columns(), order.features.len());
+        let values = stride * size_of::<u32>() + (columns + 3) * stride * size_of::<f32>();
+        let small = columns
+            + features * (6 * size_of::<f64>() + size_of::<f32>())
+            + (features + 3) * (size_of::<usize>() + size_of::<f32>());
+        (values + small) as u64
+            + Histograms::bytes(columns, stride, bins)
+            + Block::bytes(room.pixels, room.samples, varying, order)
+            + Cluster::bytes(features)
     }
 
-    fn column(&mut self, column: usize, rows: usize) -> &mut [f32] {
-        &mut self.columns[column * self.stride..][..padded(rows)]
+    /// The neighbourhood, as records of the block.
+    #[cfg(test)]
+    pub(super) fn rows(&self) -> &[u32] {
+        &self.rows[..self.count]
+    }
+
+    /// Some columns of the neighbourhood, filled up to whole lanes.
+    #[inline(always)]
+    pub(super) fn columns<const N: usize>(&mut self, columns: [usize; N]) -> [&mut [f32]; N] {
+        let (stride, rows) = (self.stride, padded(self.count));
+        match self.columns.get_disjoint_mut(columns.map(|column| column * stride..column * stride + rows)) {
+            Ok(columns) => columns,
+            Err(_) => unreachable!("columns do not overlap"),
+        }
+    }
+
+    /// Normalises some gathered columns, and scales them; says what they spanned.
+    #[inline(always)]
+    fn normalise<S: Simd, const N: usize>(&mut self, simd: S, columns: [usize; N], factors: &[f32; N]) -> [Span; N] {
+        let count = self.count;
+        for column in columns {
+            if self.order.features.contains(&column) && self.cluster.missing(column) {
+                let [values] = self.columns([column]);
+                impute(simd, values, count);
+            }
+        }
+        let mut columns = self.columns(columns);
+        let spans = make_safe(simd, &mut columns);
+        normalise(simd, &mut columns, count, &spans, factors);
+        spans
+    }
+
+    /// The normalised columns of the colour channels, scaled, from the radiance; of a grey scene only the first.
+    #[inline(always)]
+    fn normalise_colors<S: Simd>(&mut self, simd: S, twins: &[usize; 3], spans: &[Span; 3], factors: &[f32; 3]) {
+        let (rows, first) = (padded(self.count), self.order.colors.start * self.stride);
+        let places = self.columns[first..].chunks_exact_mut(self.stride);
+        for (place, radiance) in places.zip(self.radiance.chunks_exact(self.stride)) {
+            place[..rows].copy_from_slice(&radiance[..rows]);
+        }
+        let (count, first) = (self.count, self.order.colors.start);
+        match twins {
+            [0, 0, 0] => normalise(simd, &mut self.columns([first]), count, &[spans[0]], &[factors[0]]),
+            _ => normalise(simd, &mut self.columns([first, first + 1, first + 2]), count, spans, factors),
+        }
+    }
+
+    /// Columns of the neighbourhood that are not constant there; of equal colours one.
+    pub(super) fn varying(&self, twins: &[usize; 3]) -> Columns {
+        let count = |mut columns: std::ops::Range<usize>| {
+            let varying = columns.by_ref().filter(|&column| !self.constant[column]).count();
+            varying as u64
+        };
+        let ColumnOrder { features, positions, random, colors } = self.order.clone();
+        let own = colors.clone().zip(twins.iter().enumerate()).filter(|(_, (channel, twin))| channel == *twin);
+        Columns {
+            positions: count(positions),
+            random: count(random),
+            features: count(features),
+            colors: own.filter(|(column, _)| !self.constant[*column]).count() as u64,
+        }
     }
 }
 
+/// Columns that are normalised at a time.
+const BATCH: usize = 4;
+
 impl Pass<'_> {
-    /// Draws the neighbourhood of a pixel; false if it has no samples.
-    pub(super) fn gather(&self, scratch: &mut Scratch, x: u32, y: u32) -> bool {
-        let own = self.tile.samples_of(self.tile.geometry().window().index(x, y)).len();
-        if own == 0 {
-            return false;
-        }
-        let clustering = Clustering {
-            position: self.params.position_threshold,
-            feature: self.params.feature_threshold,
-            floor: self.params.threshold_floor,
-        };
-        let key = random::pixel_key(self.execution.seed, x, y, self.t);
-        let center = Center { x, y, key, wanted: self.params.neighbors(self.t, own) };
-        gather_rows(&mut scratch.rows, self.tile, self.relevant, &self.offsets, &clustering, &center);
-        true
+    /// Whether a pixel is passed through.
+    pub(super) fn settled(&self, x: u32, y: u32) -> bool {
+        self.settled.get(self.tile.geometry().window().index(x, y)) == Some(&true)
     }
 
-    /// Copies a column's values into place and normalises them; says what they span.
+    /// Takes up the samples around a rectangle of pixels; positions and random parameters if they will be wanted.
     #[inline(always)]
-    fn load<S: Simd>(&self, simd: S, scratch: &mut Scratch, column: usize, source: Source, missing: bool) -> Span {
-        let rows = scratch.rows.samples.len();
-        let stride = scratch.stride;
-        let values = &mut scratch.columns[column * stride..][..padded(rows)];
-        let window = self.tile.geometry().window();
-        match source {
-            Source::Plane(plane) => match self.tile.plane(plane) {
-                Plane::Values(plane) => {
-                    for (value, &sample) in values.iter_mut().zip(&scratch.rows.samples) {
-                        *value = plane[sample as usize];
-                    }
-                }
-                Plane::Constant(constant) => values.fill(*constant),
-            },
-            Source::CenterX => {
-                for (value, &pixel) in values.iter_mut().zip(&scratch.rows.pixels) {
-                    *value = (window.x + pixel % window.width) as f32 + 0.5;
-                }
-            }
-            Source::CenterY => {
-                for (value, &pixel) in values.iter_mut().zip(&scratch.rows.pixels) {
-                    *value = (window.y + pixel / window.width) as f32 + 0.5;
-                }
-            }
+    pub(super) fn load<S: Simd>(&self, simd: S, scratch: &mut Scratch, pixels: &Rect, others: bool) {
+        let window = pixels.grown(self.params.boxes[self.t] / 2, &self.tile.geometry().window());
+        scratch.block.load(simd, self.tile, self.relevant, self.colors, window, others);
+    }
+
+    /// Draws the neighbourhood of a pixel; false if it has no samples.
+    #[inline(always)]
+    pub(super) fn gather<S: Simd>(&self, simd: S, scratch: &mut Scratch, x: u32, y: u32) -> bool {
+        let Scratch { block, cluster, rows, count, .. } = scratch;
+        let own = block.samples_of(x, y);
+        if own.is_empty() {
+            return false;
         }
-        if missing {
-            impute(&mut values[..rows]);
-        }
-        pad(values, rows);
-        let span = span(simd, values);
-        normalise(simd, values, rows, &span);
-        span
+        let key = random::pixel_key(self.execution.seed, x, y, self.t);
+        let center = Center { x, y, key, wanted: self.params.neighbors(self.t, own.len()) };
+        cluster.set(simd, block, own);
+        *count = gather_rows(simd, rows, &self.tile.geometry().image(), block, &self.offsets, cluster, &center);
+        let first = rows[0];
+        rows[*count..padded(*count)].fill(first);
+        true
     }
 
     /// Copies the colours into place, scaled to a safe size, and says what they span.
     #[inline(always)]
     pub(super) fn load_radiance<S: Simd>(&self, simd: S, scratch: &mut Scratch) -> [Span; 3] {
-        let rows = scratch.rows.samples.len();
-        let mut channels = scratch.radiance.chunks_exact_mut(scratch.stride);
-        let (Some(red), Some(green), Some(blue)) = (channels.next(), channels.next(), channels.next()) else {
-            unreachable!("there are three channels")
-        };
-        for (row, &sample) in scratch.rows.samples.iter().enumerate() {
-            let color = &self.colors[3 * sample as usize..][..3];
-            (red[row], green[row], blue[row]) = (color[0], color[1], color[2]);
-        }
-        [red, green, blue].map(|channel| {
-            let values = &mut channel[..padded(rows)];
-            pad(values, rows);
-            let span = span(simd, values);
-            if span.scale != 1.0 {
-                values.iter_mut().for_each(|v| *v *= span.scale);
-            }
-            span
-        })
-    }
-
-    /// A colour channel's normalised column, from the scaled radiance.
-    #[inline(always)]
-    fn load_color<S: Simd>(&self, simd: S, scratch: &mut Scratch, column: usize, channel: usize, span: &Span) {
-        let rows = scratch.rows.samples.len();
-        let stride = scratch.stride;
-        let values = &mut scratch.columns[column * stride..][..padded(rows)];
-        values.copy_from_slice(&scratch.radiance[channel * stride..][..padded(rows)]);
-        normalise(simd, values, rows, &Span { min: span.min, max: span.max, scale: 1.0 });
+        let Scratch { block, rows, count, radiance, stride, .. } = scratch;
+        let rows = &rows[..padded(*count)];
+        let (red, rest) = radiance.split_at_mut(*stride);
+        let (green, blue) = rest.split_at_mut(*stride);
+        let [red, green, blue] = [red, green, blue].map(|channel| &mut channel[..rows.len()]);
+        block.gather_colors(rows, [&mut *red, &mut *green, &mut *blue]);
+        make_safe(simd, &mut [red, green, blue])
     }
 
     /// Steps 1 to 4 at one pixel, into `scratch.weights`; false if it has no samples.
     #[inline(always)]
     pub(crate) fn weigh<S: Simd>(&self, simd: S, scratch: &mut Scratch, x: u32, y: u32) -> bool {
-        self.gather(scratch, x, y) && {
+        self.gather(simd, scratch, x, y) && {
             let spans = self.load_radiance(simd, scratch);
             self.weigh_gathered(simd, scratch, &spans);
+            self.count_weighing(scratch, &spans, x, y);
             true
         }
     }
 
     /// Steps 2 to 4 of a gathered neighbourhood: loads every column, and sets `scratch.weights`.
     #[inline(always)]
-    pub(super) fn weigh_gathered<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
-        let order = ColumnOrder::of(self.relevant);
-        let rows = scratch.rows.samples.len();
-        scratch.histograms.start(rows);
+    fn weigh_gathered<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
         simd.vectorize(
             #[inline(always)]
-            || {
-                let positions = self.relevant.positions().iter().map(|&source| (source, false));
-                let random = self.relevant.random().iter().map(|&plane| (Source::Plane(plane), false));
-                let features = self.relevant.features().iter().map(|f| (Source::Plane(f.plane), f.missing));
-                for (column, (source, missing)) in positions.chain(random).chain(features).enumerate() {
-                    let constant = self.load(simd, scratch, column, source, missing).constant();
-                    let values = &scratch.columns[column * scratch.stride..][..padded(rows)];
-                    scratch.histograms.set(simd, column, values, constant, self.terms);
-                }
-                for (channel, span) in spans.iter().enumerate() {
-                    let column = order.colors + channel;
-                    self.load_color(simd, scratch, column, channel, span);
-                    let values = &scratch.columns[column * scratch.stride..][..padded(rows)];
-                    scratch.histograms.set(simd, column, values, span.constant(), self.terms);
-                }
-            },
+            || self.load_columns(simd, scratch),
         );
         simd.vectorize(
             #[inline(always)]
-            || {
-                let Scratch { histograms, dependencies, .. } = scratch;
-                let of = |x: usize, y: usize| histograms.information(x, y, self.terms);
-                for (channel, column) in (order.colors..order.end).enumerate() {
-                    dependencies.color_position[channel] = (0..order.random).map(|p| of(column, p)).sum();
-                    dependencies.color_random[channel] = (order.random..order.features).map(|r| of(column, r)).sum();
-                }
-                for (feature, column) in (order.features..order.colors).enumerate() {
-                    dependencies.feature_position[feature] = (0..order.random).map(|p| of(column, p)).sum();
-                    dependencies.feature_random[feature] = (order.random..order.features).map(|r| of(column, r)).sum();
-                    dependencies.color_feature[feature] = (order.colors..order.end).map(|c| of(c, column)).sum();
-                }
-            },
+            || self.normalise_columns(simd, scratch, spans),
         );
+        simd.vectorize(
+            #[inline(always)]
+            || self.count_bins(simd, scratch),
+        );
+        simd.vectorize(
+            #[inline(always)]
+            || self.measure_dependencies(simd, scratch),
+        );
+    }
+
+    /// Copies every column but the colours' into place.
+    #[inline(always)]
+    pub(super) fn load_columns<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
+        let Scratch { block, columns, rows, count, stride, order, .. } = scratch;
+        let (rows, others) = (&rows[..padded(*count)], order.positions.start * *stride);
+        block.gather_features(simd, rows, columns, *stride);
+        block.gather_others(simd, rows, &mut columns[others..], *stride);
+    }
+
+    /// Step 2: normalises every column, and notes which are constant.
+    #[inline(always)]
+    pub(super) fn normalise_columns<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
+        let ColumnOrder { features, positions, random, colors } = scratch.order.clone();
+        for part in [features, positions.start..random.end] {
+            let whole = part.end - part.len() % BATCH;
+            for first in (part.start..whole).step_by(BATCH) {
+                let batch = [first, first + 1, first + 2, first + 3];
+                let spans = scratch.normalise(simd, batch, &[1.0; BATCH]);
+                for (column, span) in batch.into_iter().zip(spans) {
+                    scratch.constant[column] = span.constant();
+                }
+            }
+            for column in whole..part.end {
+                let [span] = scratch.normalise(simd, [column], &[1.0]);
+                scratch.constant[column] = span.constant();
+            }
+        }
+        scratch.normalise_colors(simd, self.relevant.twins(), spans, &[1.0; 3]);
+        for (column, span) in colors.zip(spans) {
+            scratch.constant[column] = span.constant();
+        }
+    }
+
+    /// The histograms of all normalised columns.
+    #[inline(always)]
+    pub(super) fn count_bins<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
+        let Scratch { histograms, columns, constant, order, count, stride, .. } = scratch;
+        let ColumnOrder { features, positions, random, colors } = order.clone();
+        histograms.start(*count);
+        let twins = self.relevant.twins().iter().enumerate();
+        let colors = colors.zip(twins).filter(|(_, (channel, twin))| channel == *twin).map(|(column, _)| column);
+        for column in features.chain(positions.start..random.end).chain(colors) {
+            let values = &columns[column * *stride..][..padded(*count)];
+            histograms.set(simd, column, values, constant[column], self.terms);
+        }
+    }
+
+    /// Steps 3 and 4, from the histograms.
+    #[inline(always)]
+    pub(super) fn measure_dependencies<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
+        let Scratch { histograms, dependencies, order, .. } = &mut *scratch;
+        let ColumnOrder { features, positions, random, colors } = order.clone();
+        for (channel, &twin) in self.relevant.twins().iter().enumerate() {
+            let column = colors.start + twin;
+            if twin == channel {
+                dependencies.color_position[channel] =
+                    histograms.information(simd, column, &positions, self.terms).iter().sum();
+                dependencies.color_random[channel] =
+                    histograms.information(simd, column, &random, self.terms).iter().sum();
+                dependencies.color_features[channel]
+                    .copy_from_slice(histograms.information(simd, column, &features, self.terms));
+            } else {
+                dependencies.copy_color(twin, channel);
+            }
+        }
+        dependencies.add_colors();
+        for (feature, column) in features.enumerate() {
+            dependencies.feature_position[feature] =
+                histograms.information(simd, column, &positions, self.terms).iter().sum();
+            dependencies.feature_random[feature] =
+                histograms.information(simd, column, &random, self.terms).iter().sum();
+        }
         scratch.weights.set(&scratch.dependencies, self.t);
     }
 
@@ -242,83 +334,132 @@ impl Pass<'_> {
         y: u32,
         out: &mut [f32],
     ) {
-        if !self.gather(scratch, x, y) {
+        let gathered = simd.vectorize(
+            #[inline(always)]
+            || self.gather(simd, scratch, x, y),
+        );
+        if !gathered {
             return;
         }
-        let order = ColumnOrder::of(self.relevant);
-        let spans = self.load_radiance(simd, scratch);
-        // Without weights around, the pixel's own: they load every column; else only those that count are loaded below.
+        let spans = simd.vectorize(
+            #[inline(always)]
+            || self.load_radiance(simd, scratch),
+        );
+        // Without weights around, the pixel's own: they load every column; else only those that count are normalised.
         let interpolated = grid.is_some_and(|grid| grid.interpolate(x, y, &mut scratch.weights));
         if !interpolated {
             self.weigh_gathered(simd, scratch, &spans);
+            self.count_weighing(scratch, &spans, x, y);
         }
-        let rows = scratch.rows.samples.len();
-        let steepness = steepness(scratch.weights.confidence, self.params.sigma8_squared, out.len() / 3);
+        simd.vectorize(
+            #[inline(always)]
+            || self.scale_columns(simd, scratch, &spans, interpolated, out.len() / 3),
+        );
+        simd.vectorize(
+            #[inline(always)]
+            || self.filter_samples(simd, scratch, &spans, out),
+        );
+        self.count_filtering(scratch, interpolated, x, y);
+    }
+
+    /// Step 5, with scaled columns.
+    #[inline(always)]
+    pub(super) fn filter_samples<S: Simd>(&self, simd: S, scratch: &Scratch, spans: &[Span; 3], out: &mut [f32]) {
+        let Scratch { columns, stride, active, radiance, count, .. } = scratch;
+        let distances =
+            Distances { columns, stride: *stride, active, radiance, spans, twins: self.relevant.twins(), rows: *count };
+        bilateral::filter(simd, &distances, out);
+    }
+
+    /// Scales the columns that weigh anything by their factors, and lists them; they are normalised first, if `fresh`.
+    #[inline(always)]
+    pub(super) fn scale_columns<S: Simd>(
+        &self,
+        simd: S,
+        scratch: &mut Scratch,
+        spans: &[Span; 3],
+        fresh: bool,
+        own: usize,
+    ) {
+        let steepness = steepness(scratch.weights.confidence, self.params.sigma8_squared, own);
         let factor = |weight: f32| (0.5 * steepness * f64::from(weight)).sqrt() as f32;
         // A difference that weighs nothing adds 0.
         let counts = |factor: f32| factor > 0.0 || !self.execution.leave_out;
-        scratch.active.clear();
-        for feature in 0..self.relevant.features().len() {
-            let factor = factor(scratch.weights.features[feature]);
+        if fresh && scratch.weights.features.iter().any(|&weight| counts(factor(weight))) {
+            let Scratch { block, columns, rows, count, stride, .. } = &mut *scratch;
+            block.gather_features(simd, &rows[..padded(*count)], columns, *stride);
+        }
+        let Scratch { active, factors, weights, order, .. } = &mut *scratch;
+        active.clear();
+        factors.clear();
+        // A colour that equals another counts as that one once more.
+        let colors = self.relevant.twins().map(|twin| order.colors.start + twin);
+        let columns = order.features.clone().chain(colors);
+        for (column, &weight) in columns.zip(weights.features.iter().chain(&weights.color)) {
+            let factor = factor(weight);
             if counts(factor) {
-                let column = order.features + feature;
-                if interpolated {
-                    let feature = self.relevant.features()[feature];
-                    self.load(simd, scratch, column, Source::Plane(feature.plane), feature.missing);
-                }
-                scratch.column(column, rows).iter_mut().for_each(|v| *v *= factor);
-                scratch.active.push(column);
+                active.push(column);
+                factors.push(factor);
             }
         }
-        for (channel, span) in spans.iter().enumerate() {
-            let factor = factor(scratch.weights.color[channel]);
-            if counts(factor) {
-                let column = order.colors + channel;
-                if interpolated {
-                    self.load_color(simd, scratch, column, channel, span);
+        let (active, factors) = (std::mem::take(active), std::mem::take(factors));
+        if fresh {
+            let features = active.partition_point(|&column| column < scratch.order.features.end);
+            let (batches, rest) = active[..features].as_chunks::<BATCH>();
+            let (factor_batches, factor_rest) = factors[..features].as_chunks::<BATCH>();
+            for (batch, factors) in batches.iter().zip(factor_batches) {
+                scratch.normalise(simd, *batch, factors);
+            }
+            for (column, factor) in rest.iter().zip(factor_rest) {
+                scratch.normalise(simd, [*column], &[*factor]);
+            }
+            if features < active.len() {
+                scratch.normalise_colors(simd, self.relevant.twins(), spans, &scratch.weights.color.map(factor));
+            }
+        } else {
+            for (index, (&column, factor)) in active.iter().zip(&factors).enumerate() {
+                if active[..index].contains(&column) {
+                    continue;
                 }
-                scratch.column(column, rows).iter_mut().for_each(|v| *v *= factor);
-                scratch.active.push(column);
+                let [values] = scratch.columns([column]);
+                values.iter_mut().for_each(|v| *v *= factor);
             }
         }
-        let distances = Distances {
-            columns: &scratch.columns,
-            stride: scratch.stride,
-            active: &scratch.active,
-            radiance: &scratch.radiance,
-            spans: &spans,
-            rows,
-        };
-        simd.vectorize(
-            #[inline(always)]
-            || bilateral::filter(simd, &distances, out),
-        );
+        (scratch.active, scratch.factors) = (active, factors);
     }
 
-    /// Filters the pixels of `band`. `out` holds the colours of its rows, from the data window's left edge to its right.
+    /// Filters a block of pixels. `rows` holds the colours of each of its rows.
     #[inline(always)]
-    pub(crate) fn band<S: Simd>(
+    pub(crate) fn block<S: Simd>(
         &self,
         simd: S,
         scratch: &mut Scratch,
         grid: Option<&Grid>,
-        band: &Rect,
-        out: &mut [f32],
+        pixels: &Rect,
+        rows: Vec<&mut [f32]>,
     ) {
-        let window = self.tile.geometry().window();
-        let start = self.tile.samples_of(window.index(window.x, band.y)).start;
-        // Column by column, so that what one neighbourhood has brought into the cache serves the next.
-        for x in band.x..band.right() {
-            for y in band.y..band.bottom() {
+        let core = self.tile.geometry().core();
+        simd.vectorize(
+            #[inline(always)]
+            || self.load(simd, scratch, pixels, grid.is_none_or(|grid| !grid.complete(pixels))),
+        );
+        for (y, mut row) in (pixels.y..).zip(rows) {
+            for x in pixels.x..pixels.right() {
                 if self.execution.stopped() {
                     return;
                 }
-                let samples = self.tile.samples_of(window.index(x, y));
-                let out = &mut out[3 * (samples.start - start)..3 * (samples.end - start)];
+                let samples = scratch.block.samples_of(x, y).len();
+                let (out, rest) = row.split_at_mut(3 * samples);
+                row = rest;
+                if self.settled(x, y) {
+                    let samples = self.tile.samples_of(self.tile.geometry().window().index(x, y));
+                    out.copy_from_slice(&self.colors[3 * samples.start..3 * samples.end]);
+                    continue;
+                }
                 self.pixel(simd, scratch, grid, x, y, out);
                 if self.params.spikes {
                     let spikes = spikes::tame(out);
-                    if self.tile.geometry().core().contains(x, y) {
+                    if core.contains(x, y) {
                         scratch.spikes += spikes;
                     }
                 }

@@ -2,15 +2,20 @@
 //!
 //! | step | file |
 //! |---|---|
-//! | 1 neighbourhood | `neighborhood.rs` |
+//! | the samples around a block of pixels | `block.rs` |
+//! | 1 neighbourhood | `neighborhood.rs`, `cluster.rs` |
 //! | 2 normalising | `statistics.rs` |
 //! | 3 dependencies | `information.rs` |
 //! | 4 weights | `weights.rs`, `grid.rs` |
 //! | 5 filter | `bilateral.rs` |
 //! | 6 spikes | `spikes.rs` |
+//! | what is left out | `relevance.rs`, and what that saves: `work.rs` |
+//! | what is passed through on request | `settled.rs` |
 //! | iterations | `iteration.rs` (one pass), and this file |
 
 mod bilateral;
+mod block;
+mod cluster;
 mod grid;
 mod information;
 mod iteration;
@@ -18,26 +23,56 @@ mod neighborhood;
 pub mod params;
 mod random;
 mod relevance;
+mod settled;
 mod spikes;
+#[cfg(feature = "bench")]
+#[doc(hidden)]
+pub mod stages;
 mod statistics;
 mod weights;
+pub(crate) mod work;
 
 #[cfg(test)]
 mod tests;
 
+pub use neighborhood::Offsets;
 pub use params::Params;
 
 use super::finish::finish;
 use super::lanes::dispatch;
 use super::plan::{Plan, Shape};
-use super::share::share_out;
-use super::{Execution, Filtered, Plane, Rect, Report, SampleTile, Stopped, TileGeometry};
+use super::share::{blocks, blocks_bytes, share_out};
+use super::{Execution, Filtered, Plane, Rect, Report, Role, SampleTile, Stopped, TileGeometry, Work};
+use block::ColumnOrder;
 use grid::Grid;
-use iteration::{Pass, Scratch};
+use iteration::{Pass, Room, Scratch};
 use relevance::Relevant;
 
-/// Rows of pixels that a thread takes at a time.
-const BAND: u32 = 8;
+/// Side of the blocks of pixels that a thread takes at a time: what such a block reaches should stay in the cache, and
+/// there should be blocks enough for all threads to the end.
+const BLOCK: u32 = 16;
+
+/// Side of the blocks of nodes that a thread takes at a time.
+const fn node_block_side(spacing: u32) -> u32 {
+    if spacing >= 32 { 1 } else { 32 / spacing }
+}
+
+/// Room for the greatest block and neighbourhood of a tile of this shape.
+fn room(geometry: &TileGeometry, params: &Params, samples: u64, max_per_pixel: u32, varying: bool) -> Room {
+    let window = geometry.window();
+    let pixels = (0..params.boxes.len()).map(|t| {
+        let (radius, region) = (params.boxes[t] / 2, region(geometry, params, varying, t));
+        let nodes = match params.information_grid {
+            1 => 0,
+            spacing => (node_block_side(spacing) - 1) * spacing + 1,
+        };
+        let across = |region: u32, window: u32| (BLOCK.min(region).max(nodes) + 2 * radius).min(window) as usize;
+        across(region.width, window.width) * across(region.height, window.height)
+    });
+    let pixels = pixels.max().unwrap_or(0);
+    let samples = (pixels * max_per_pixel as usize).min(samples as usize);
+    Room { pixels, samples, rows: most_rows(params, max_per_pixel as usize) }
+}
 
 /// What iteration `t` has to compute: what later ones read, inside the data window.
 pub(super) fn region(geometry: &TileGeometry, params: &Params, varying: bool, t: usize) -> Rect {
@@ -47,18 +82,24 @@ pub(super) fn region(geometry: &TileGeometry, params: &Params, varying: bool, t:
 
 /// Bytes for the method's own buffers: whole tile, and per thread.
 pub(super) fn plan(shape: &Shape, params: &Params) -> Plan {
-    let features = shape.channels.planes_of(|role| matches!(role, super::Role::Feature { .. })).len();
+    let count = |wanted: fn(&Role) -> bool| shape.channels.planes_of(wanted).len();
+    let features = count(|role| matches!(role, Role::Feature { .. }));
     // Without a film position the pixel's centre takes its place.
-    let film = shape.channels.planes_of(|role| matches!(role, super::Role::Film)).len();
-    let columns = shape.channels.planes() + 2 - film;
-    let rows = most_rows(params, shape.max_per_pixel as usize);
+    let order = ColumnOrder::new(features, 2, count(|role| matches!(role, Role::Random { .. })));
+    let region = region(shape.geometry, params, shape.varying, 0);
+    let pixels = shape.geometry.window().area();
     let grid = match params.information_grid {
         1 => 0,
-        spacing => Grid::bytes(spacing, &region(shape.geometry, params, shape.varying, 0), features),
+        spacing => Grid::bytes(spacing, &region, features),
     };
+    let room = room(shape.geometry, params, shape.samples, shape.max_per_pixel, shape.varying);
     Plan {
-        working: shape.samples * 2 * 3 * 4 + grid + (rows as u64 + 1) * 8,
-        per_thread: Scratch::bytes(columns, features, rows, params.bins),
+        working: shape.samples * 2 * 3 * 4
+            + grid
+            + (room.rows as u64 + 1) * 8
+            + blocks_bytes(&region)
+            + settled::bytes(params, pixels),
+        per_thread: Scratch::bytes(&order, &room, shape.varying, params.bins),
         ..Plan::default()
     }
 }
@@ -68,8 +109,10 @@ fn most_rows(params: &Params, max_per_pixel: usize) -> usize {
     (0..params.boxes.len()).map(|t| params.neighbors(t, max_per_pixel)).max().unwrap_or(0)
 }
 
-/// The samples, and their pixels in the data window, that the draws around a pixel end at, before any is rejected.
+/// The samples, and their pixels in the data window, that the draws around a pixel end at, before any is rejected;
+/// `offsets` are those of iteration `t`.
 pub(super) fn draws(
+    offsets: &Offsets,
     tile: &SampleTile,
     params: &Params,
     seed: u64,
@@ -79,10 +122,9 @@ pub(super) fn draws(
 ) -> impl Iterator<Item = (usize, usize)> {
     let (image, window) = (tile.geometry().image(), tile.geometry().window());
     let own = tile.samples_of(window.index(x, y)).len();
-    let offsets = neighborhood::Offsets::new(params.boxes[t]);
     let center = neighborhood::Center { x, y, key: random::pixel_key(seed, x, y, t), wanted: params.neighbors(t, own) };
     (0..(center.wanted - own) as u64).filter_map(move |draw| {
-        let (pixel, bits) = neighborhood::candidate(&image, &window, &offsets, &center, draw)?;
+        let (pixel, bits) = neighborhood::candidate(&image, &window, offsets, &center, draw)?;
         let samples = tile.samples_of(pixel);
         (!samples.is_empty()).then(|| (pixel, neighborhood::pick_sample(bits, &samples) as usize))
     })
@@ -110,18 +152,19 @@ fn iterate(
     mut after: impl FnMut(&[f32]),
 ) -> Result<(Vec<f32>, Report), Stopped> {
     let relevant = Relevant::of(tile, execution.leave_out);
-    let rows = most_rows(params, tile.max_per_pixel() as usize);
-    let terms = information::entropy_terms(rows);
-    let threads = execution.threads();
-    let mut scratches = Vec::with_capacity(threads);
-    scratches.resize_with(threads, || Scratch::new(&relevant, rows, params.bins, execution.leave_out));
+    let room = room(tile.geometry(), params, tile.total() as u64, tile.max_per_pixel(), tile.varying());
+    let terms = information::entropy_terms(room.rows);
+    let mut scratches = Vec::with_capacity(execution.threads());
+    scratches.resize_with(execution.threads(), || Scratch::new(tile, &relevant, params, &room, execution.leave_out));
+    let settled = settled::settled(tile, params);
     let mut colors = interleaved_colors(tile);
     let mut next = vec![0.0; colors.len()];
     let iterations = params.boxes.len();
     for t in 0..iterations {
         let region = region(tile.geometry(), params, tile.varying(), t);
-        let offsets = neighborhood::Offsets::new(params.boxes[t]);
-        let pass = Pass { tile, relevant: &relevant, params, t, execution, offsets, terms: &terms, colors: &colors };
+        let offsets = Offsets::new(params.boxes[t]);
+        let (relevant, terms, settled) = (&relevant, &terms, &settled);
+        let pass = Pass { tile, relevant, params, t, execution, offsets, terms, settled, colors: &colors };
         run(&pass, &region, &mut scratches, &mut next);
         if execution.stopped() {
             return Err(Stopped);
@@ -133,15 +176,23 @@ fn iterate(
         }
     }
     let spikes = scratches.iter().map(|scratch| scratch.spikes).sum();
+    let mut work = Work::default();
+    scratches.iter().for_each(|scratch| work += scratch.work);
     drop((scratches, next));
+    let (core, window) = (tile.geometry().core(), tile.geometry().window());
+    let inside = (core.y..core.bottom()).flat_map(|y| (core.x..core.right()).map(move |x| window.index(x, y)));
+    let settled = inside.filter(|&pixel| settled.get(pixel) == Some(&true) && !tile.samples_of(pixel).is_empty());
     let report = Report {
         replaced: tile.replaced(),
+        settled: settled.clone().count() as u64,
+        settled_error: settled.fold(0.0, |sum, pixel| sum + settled::error(tile, pixel)),
         spikes,
         halo: tile.geometry().halo(),
         halo_needed: tile.geometry().halo_for(params.reach(tile.varying())),
-        left_out: relevant.left_out,
+        work: Some(work),
         ..Report::default()
     };
+    let report = report.leaving_out(relevant.left_out, tile);
     Ok((colors, report))
 }
 
@@ -160,29 +211,28 @@ fn interleaved_colors(tile: &SampleTile) -> Vec<f32> {
 
 /// One iteration over a region, from `pass.colors` to `next`.
 fn run(pass: &Pass, region: &Rect, scratches: &mut [Scratch], next: &mut [f32]) {
-    let execution = pass.execution;
+    let Pass { tile, params, execution, .. } = *pass;
     let level = execution.simd.level();
-    let window = pass.tile.geometry().window();
-    let spacing = pass.params.information_grid;
+    let window = tile.geometry().window();
+    let spacing = params.information_grid;
     let grid = (spacing > 1).then(|| {
-        let image = pass.tile.geometry().image();
-        let mut grid = Grid::new(spacing, image, region, pass.relevant.features().len());
-        let (rows, nodes) = grid.rows();
-        share_out(execution, scratches, nodes, |scratch, (row, nodes)| {
-            dispatch!(level, simd => rows.weigh(simd, pass, scratch, row, nodes));
+        let mut grid = Grid::new(spacing, tile.geometry().image(), region, pass.relevant.features().len());
+        let (places, nodes, values) = (grid.places(), grid.nodes(), grid.values());
+        let end = |x: u32, y: u32| (y as usize * nodes.width as usize + x as usize) * values;
+        let blocks = blocks(nodes, node_block_side(spacing), grid.all(), end);
+        share_out(execution, scratches, blocks, |scratch, (nodes, rows)| {
+            dispatch!(level, simd => places.weigh(simd, pass, scratch, &nodes, rows));
         });
         grid
     });
-    let bands = (region.y..region.bottom()).step_by(BAND as usize).scan((next, 0), |(rest, done), y| {
-        let band = Rect::new(region.x, y, region.width, BAND.min(region.bottom() - y));
-        let first = 3 * pass.tile.samples_of(window.index(window.x, band.y)).start;
-        let end = 3 * pass.tile.samples_of(window.index(window.right() - 1, band.bottom() - 1)).end;
-        let (out, after) = std::mem::take(rest)[first - *done..].split_at_mut(end - first);
-        (*rest, *done) = (after, end);
-        Some((band, out))
-    });
-    share_out(execution, scratches, bands, |scratch, (band, out)| {
-        dispatch!(level, simd => pass.band(simd, scratch, grid.as_ref(), &band, out));
+    // Where the values of the pixels left of x end.
+    let end = |x: u32, y: u32| match x == window.x {
+        true => 3 * tile.samples_of(window.index(x, y)).start,
+        false => 3 * tile.samples_of(window.index(x - 1, y)).end,
+    };
+    let blocks = blocks(*region, BLOCK, next, end);
+    share_out(execution, scratches, blocks, |scratch, (pixels, rows)| {
+        dispatch!(level, simd => pass.block(simd, scratch, grid.as_ref(), &pixels, rows));
     });
 }
 

@@ -37,6 +37,9 @@ pub struct Params {
     pub feature_threshold: f64,
     /// A difference from the pixel's mean that is never too far, in the feature's own units: 0 to 1e30.
     pub threshold_floor: f64,
+    /// Pixels whose own samples say that filtering can take less than this off their relMSE, at most, are passed through:
+    /// 0, none, to 1. An estimate; see `settled.rs`.
+    pub tolerance: f64,
 }
 
 impl Params {
@@ -53,6 +56,7 @@ impl Params {
             position_threshold: 30.0,
             feature_threshold: 3.0,
             threshold_floor: 0.1,
+            tolerance: 0.0,
         }
     }
 
@@ -67,7 +71,7 @@ impl Params {
     }
 
     /// Every parameter's name and value in words.
-    pub fn entries(&self) -> [(&'static str, String); 10] {
+    pub fn entries(&self) -> [(&'static str, String); 11] {
         fn list<T: ToString>(values: &[T]) -> String {
             values.iter().map(T::to_string).collect::<Vec<_>>().join(",")
         }
@@ -82,6 +86,7 @@ impl Params {
             ("position_threshold", self.position_threshold.to_string()),
             ("feature_threshold", self.feature_threshold.to_string()),
             ("threshold_floor", self.threshold_floor.to_string()),
+            ("tolerance", self.tolerance.to_string()),
         ]
     }
 
@@ -104,6 +109,7 @@ impl Params {
             "position_threshold" => self.position_threshold = one("position_threshold", value, "a number")?,
             "feature_threshold" => self.feature_threshold = one("feature_threshold", value, "a number")?,
             "threshold_floor" => self.threshold_floor = one("threshold_floor", value, "a number")?,
+            "tolerance" => self.tolerance = one("tolerance", value, "a number")?,
             _ => return Ok(false),
         }
         Ok(true)
@@ -130,6 +136,7 @@ impl Params {
             ((1.0..=1e6).contains(&self.position_threshold), "must be 1 to 1e6".to_owned()),
             ((1.0..=1e6).contains(&self.feature_threshold), "must be 1 to 1e6".to_owned()),
             ((0.0..=1e30).contains(&self.threshold_floor), "must be 0 to 1e30".to_owned()),
+            ((0.0..=1.0).contains(&self.tolerance), "must be 0 to 1".to_owned()),
         ];
         for ((name, value), (right, rule)) in self.entries().into_iter().zip(rules) {
             if !right {
@@ -206,6 +213,8 @@ mod tests {
             ("position_threshold", "1", "0.5"),
             ("feature_threshold", "1e6", "nan"),
             ("threshold_floor", "0", "-1"),
+            ("tolerance", "1", "1.1"),
+            ("tolerance", "0", "-1e-9"),
         ] {
             assert!(with(name, good).is_ok(), "{name}={good}");
             let message = with(name, bad).unwrap_err().to_string();

@@ -1,6 +1,10 @@
 //! Which planes can have an effect. A plane that is constant over the data window is constant over every neighbourhood:
 //! it has no information, no distance and no weight, and can never reject a candidate, so leaving it out changes nothing.
+//!
+//! A colour plane that has the values of an earlier one, as in a grey scene, keeps them: each step does to both the same.
+//! Its neighbourhoods, information and filtered values are those of the earlier one.
 
+use super::work::Columns;
 use crate::filter::{LeftOut, LeftOutReason, Plane, Role, SampleTile};
 
 /// Where a column of the neighbourhood comes from.
@@ -21,8 +25,6 @@ pub(crate) struct Feature {
     pub(crate) plane: usize,
     /// Whether it is a world position.
     pub(crate) position: bool,
-    /// Whether any sample lacks it.
-    pub(crate) missing: bool,
 }
 
 /// The planes that matter, by role.
@@ -31,15 +33,26 @@ pub(crate) struct Relevant {
     positions: Vec<Source>,
     random: Vec<usize>,
     features: Vec<Feature>,
+    /// Of each colour channel the first that has the same values.
+    twins: [usize; 3],
+    /// How many columns there are without leaving any out.
+    pub(crate) columns: Columns,
     /// What was left out, and why.
     pub(crate) left_out: Vec<LeftOut>,
 }
 
 impl Relevant {
-    /// Looks at each plane of a tile. Colours always stay: they are what is filtered. Without `leave_out` all stay.
+    /// Looks at each plane of a tile. Of colours only copies go: they are what is filtered. Without `leave_out` all stay.
     pub(crate) fn of(tile: &SampleTile, leave_out: bool) -> Self {
-        let mut found = Self { positions: Vec::new(), random: Vec::new(), features: Vec::new(), left_out: Vec::new() };
-        let mut film = false;
+        let mut found = Self {
+            positions: Vec::new(),
+            random: Vec::new(),
+            features: Vec::new(),
+            twins: if leave_out { twins(tile) } else { [0, 1, 2] },
+            columns: Columns::of(tile.channels(), &[]),
+            left_out: Vec::new(),
+        };
+        let (mut film, colors) = (false, tile.channels().color_planes());
         for (plane, (channel, _)) in tile.channels().plane_channels().enumerate() {
             film |= channel.role == Role::Film;
             if let (Plane::Constant(value), true) = (tile.plane(plane), leave_out && channel.role != Role::Color) {
@@ -49,14 +62,13 @@ impl Relevant {
             }
             match channel.role {
                 Role::Film => found.positions.push(Source::Plane(plane)),
-                Role::Color => {}
-                Role::Feature { position } => {
-                    let missing = match tile.plane(plane) {
-                        Plane::Constant(value) => value.is_nan(),
-                        Plane::Values(values) => values.iter().any(|v| v.is_nan()),
-                    };
-                    found.features.push(Feature { plane, position, missing });
+                Role::Color => {
+                    if found.twins[plane - colors[0]] < plane - colors[0] {
+                        let reason = LeftOutReason::Equal;
+                        found.left_out.push(LeftOut { plane: tile.channels().plane_name(plane), reason });
+                    }
                 }
+                Role::Feature { position } => found.features.push(Feature { plane, position }),
                 Role::Random { .. } => found.random.push(plane),
             }
         }
@@ -80,4 +92,26 @@ impl Relevant {
     pub(crate) fn features(&self) -> &[Feature] {
         &self.features
     }
+
+    /// Of each colour channel the first that has the same values in every sample: often itself.
+    pub(crate) fn twins(&self) -> &[usize; 3] {
+        &self.twins
+    }
+
+    /// How many columns are kept.
+    pub(crate) fn kept(&self) -> Columns {
+        Columns {
+            positions: self.positions.len() as u64,
+            random: self.random.len() as u64,
+            features: self.features.len() as u64,
+            colors: self.twins.iter().enumerate().filter(|(channel, twin)| channel == *twin).count() as u64,
+        }
+    }
+}
+
+/// Of each colour channel the first that has the same values.
+fn twins(tile: &SampleTile) -> [usize; 3] {
+    let planes = tile.channels().color_planes().map(|plane| tile.plane(plane));
+    // Colours have no NaN and no -0.
+    [0, 1, 2].map(|channel| (0..channel).find(|&earlier| planes[earlier] == planes[channel]).unwrap_or(channel))
 }

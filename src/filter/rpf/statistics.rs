@@ -6,10 +6,10 @@
 //!
 //! Columns are padded to whole lanes with copies of their first value ([`pad`]).
 
-use crate::filter::lanes::{LANES, Lanes, Simd, keep_first, prelude::*, sum};
+use crate::filter::lanes::{LANES, Lanes, Simd, Wide, keep_first, prelude::*, sum};
 
 /// What a column's values span.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Span {
     /// Least value.
     pub(crate) min: f32,
@@ -17,6 +17,8 @@ pub(crate) struct Span {
     pub(crate) max: f32,
     /// A power of two that brings the values to a size whose squares and sums neither overflow nor vanish; mostly 1.
     pub(crate) scale: f32,
+    /// Sum of the values less the first one; of use where the scale is 1.
+    total: f32,
 }
 
 impl Span {
@@ -26,27 +28,44 @@ impl Span {
     }
 }
 
-/// Replaces missing values (NaN) by the mean of the others, so that they stand in the middle: z = 0. If all are missing
+/// Replaces missing values (NaN) among the first `n` of a padded column by the mean of the others, so that they stand in the middle: z = 0. If all are missing
 /// they become 0. A column with missing values is shifted to its first value and scaled by a power of two, which
 /// normalising does not see: far from the origin the mean itself would be rounded away from the middle.
-pub(crate) fn impute(column: &mut [f32]) {
-    let present = column.iter().filter(|v| !v.is_nan());
-    let count = present.clone().count();
-    if count == column.len() {
+#[inline(always)]
+pub(crate) fn impute<S: Simd>(simd: S, column: &mut [f32], n: usize) {
+    column[n..].fill(f32::NAN);
+    let (zero, none) = (Lanes::splat(simd, 0.0), [Wide::splat(simd, 0.0); 2]);
+    let (mut present, mut size, mut total) = (0, zero, none);
+    for chunk in column.chunks_exact(LANES) {
+        let values = Lanes::from_slice(simd, chunk);
+        let there = values.simd_eq(values);
+        present += there.to_bitmask().count_ones() as usize;
+        size = size.max(there.select(values.abs(), zero));
+    }
+    if present == n {
+        pad(column, n);
         return;
     }
-    let Some(&first) = present.clone().next() else {
+    let Some(&first) = column.iter().find(|v| !v.is_nan()) else {
         column.fill(0.0);
         return;
     };
-    let scale = safe_scale(present.fold(0.0, |size: f32, v| size.max(v.abs())));
-    let mut sum = 0.0;
-    for value in column.iter_mut().filter(|v| !v.is_nan()) {
-        *value = *value * scale - first * scale;
-        sum += f64::from(*value);
+    let scale = safe_scale(size.reduce_max());
+    let (scale, first) = (Lanes::splat(simd, scale), Lanes::splat(simd, first * scale));
+    for chunk in column.chunks_exact_mut(LANES) {
+        let values = Lanes::from_slice(simd, chunk);
+        let shifted = values * scale - first;
+        shifted.store_slice(chunk);
+        let there = values.simd_eq(values);
+        let (low, high) = there.select(shifted, zero).widen();
+        total = [total[0] + low, total[1] + high];
     }
-    let mean = (sum / count as f64) as f32;
-    column.iter_mut().filter(|v| v.is_nan()).for_each(|v| *v = mean);
+    let mean = Lanes::splat(simd, ((total[0] + total[1]).to_array().iter().sum::<f64>() / present as f64) as f32);
+    for chunk in column.chunks_exact_mut(LANES) {
+        let values = Lanes::from_slice(simd, chunk);
+        values.simd_eq(values).select(values, mean).store_slice(chunk);
+    }
+    pad(column, n);
 }
 
 /// Fills the column up from its n-th value to whole lanes.
@@ -56,19 +75,45 @@ pub(crate) fn pad(column: &mut [f32], n: usize) {
     column[n..].fill(first);
 }
 
-/// What the values of a padded column span.
+/// What the values of some padded columns span. Several at a time, so that the sums of one do not wait for those of
+/// another.
 #[inline(always)]
-pub(crate) fn span<S: Simd>(simd: S, column: &[f32]) -> Span {
-    let mut min = Lanes::splat(simd, column[0]);
-    let mut max = min;
-    for chunk in column.chunks_exact(LANES) {
-        let values = Lanes::from_slice(simd, chunk);
-        min = min.min(values);
-        max = max.max(values);
+fn spans<S: Simd, const N: usize>(simd: S, columns: &[&mut [f32]; N]) -> [Span; N] {
+    let zero = Lanes::splat(simd, 0.0);
+    let mut first = [zero; N];
+    for (first, column) in first.iter_mut().zip(columns) {
+        *first = Lanes::splat(simd, column[0]);
     }
-    let min = min.to_array().into_iter().fold(column[0], f32::min);
-    let max = max.to_array().into_iter().fold(column[0], f32::max);
-    Span { min, max, scale: safe_scale(min.abs().max(max.abs())) }
+    let (mut min, mut max, mut total) = (first, first, [zero; N]);
+    for start in (0..columns[0].len()).step_by(LANES) {
+        for k in 0..N {
+            let values = Lanes::from_slice(simd, &columns[k][start..start + LANES]);
+            min[k] = min[k].min(values);
+            max[k] = max[k].max(values);
+            total[k] += values - first[k]; // the padding adds 0
+        }
+    }
+    let mut spans = [Span::default(); N];
+    for k in 0..N {
+        let (min, max) = (min[k].reduce_min(), max[k].reduce_max());
+        spans[k] = Span { min, max, scale: safe_scale(min.abs().max(max.abs())), total: sum(total[k]) };
+    }
+    spans
+}
+
+/// Scales some padded columns of equal length to a safe size, and says what their values spanned before.
+#[inline(always)]
+pub(crate) fn make_safe<S: Simd, const N: usize>(simd: S, columns: &mut [&mut [f32]; N]) -> [Span; N] {
+    let mut before = spans(simd, columns);
+    for (column, span) in columns.iter_mut().zip(&mut before) {
+        if span.scale != 1.0 {
+            for value in column.iter_mut() {
+                *value *= span.scale;
+            }
+            span.total = spans(simd, &[&mut **column])[0].total;
+        }
+    }
+    before
 }
 
 /// A power of two by which values of this size are safe to square and to sum 65536 of.
@@ -86,32 +131,43 @@ fn safe_scale(size: f32) -> f32 {
     f32::from_bits((EXPONENT_BIAS + target - exponent) << 23)
 }
 
-/// Brings the first `n` values of a padded column to zero mean and unit deviation (with n, not n - 1), in place; what a
-/// column of equal values becomes is exactly 0. Two-pass and shifted. The padding's values mean nothing afterwards.
+/// Brings the first `n` values of some padded columns, [of safe size](make_safe), to zero mean and a deviation of their
+/// `factor` (with n, not n - 1), in place; a column of equal values becomes exactly 0. Two-pass and shifted. The padding's
+/// values mean nothing afterwards.
 #[inline(always)]
-pub(crate) fn normalise<S: Simd>(simd: S, column: &mut [f32], n: usize, span: &Span) {
-    if span.constant() {
-        column.fill(0.0);
-        return;
-    }
-    let scale = Lanes::splat(simd, span.scale);
-    let first = Lanes::splat(simd, column[0] * span.scale);
+pub(crate) fn normalise<S: Simd, const N: usize>(
+    simd: S,
+    columns: &mut [&mut [f32]; N],
+    n: usize,
+    spans: &[Span; N],
+    factors: &[f32; N],
+) {
     let zero = Lanes::splat(simd, 0.0);
-    let mut total = zero;
-    for chunk in column.chunks_exact_mut(LANES) {
-        let shifted = Lanes::from_slice(simd, chunk) * scale - first;
-        shifted.store_slice(chunk);
-        total += shifted; // the padding adds 0
+    let (mut first, mut mean, mut squares) = ([zero; N], [zero; N], [zero; N]);
+    for k in 0..N {
+        first[k] = Lanes::splat(simd, columns[k][0]);
+        mean[k] = Lanes::splat(simd, spans[k].total / n as f32);
     }
-    let mean = Lanes::splat(simd, sum(total) / n as f32);
-    let mut squares = zero;
-    for (index, chunk) in column.chunks_exact(LANES).enumerate() {
-        let deviation = Lanes::from_slice(simd, chunk) - mean;
-        squares += keep_first(simd, deviation * deviation, n - index * LANES);
+    let length = columns[0].len();
+    for start in (0..length).step_by(LANES) {
+        for k in 0..N {
+            let place = &mut columns[k][start..start + LANES];
+            let deviation = Lanes::from_slice(simd, place) - first[k] - mean[k];
+            deviation.store_slice(place);
+            squares[k] += keep_first(simd, deviation * deviation, n - start);
+        }
     }
-    let inverse = Lanes::splat(simd, 1.0 / (sum(squares) / n as f32).sqrt());
-    for chunk in column.chunks_exact_mut(LANES) {
-        ((Lanes::from_slice(simd, chunk) - mean) * inverse).store_slice(chunk);
+    let (mut inverse, mut factor) = ([zero; N], [zero; N]);
+    for k in 0..N {
+        // Of equal values not even rounding may leave anything.
+        let inverse_deviation = if spans[k].constant() { 0.0 } else { 1.0 / (sum(squares[k]) / n as f32).sqrt() };
+        (inverse[k], factor[k]) = (Lanes::splat(simd, inverse_deviation), Lanes::splat(simd, factors[k]));
+    }
+    for start in (0..length).step_by(LANES) {
+        for k in 0..N {
+            let place = &mut columns[k][start..start + LANES];
+            (Lanes::from_slice(simd, place) * inverse[k] * factor[k]).store_slice(place);
+        }
     }
 }
 
@@ -125,19 +181,20 @@ mod tests {
     fn missing_values_stand_in_the_middle_far_from_the_origin() {
         let mut column = vec![0.0; LANES];
         column[..4].copy_from_slice(&[16_777_216.0, 16_777_218.0, 16_777_218.0, f32::NAN]);
-        impute(&mut column[..4]);
-        pad(&mut column, 4);
         dispatch!(SimdLevel::default().level(), simd => {
-            let span = span(simd, &column);
-            normalise(simd, &mut column, 4, &span);
+            impute(simd, &mut column, 4);
+            let mut columns = [&mut column[..]];
+            let spans = make_safe(simd, &mut columns);
+            normalise(simd, &mut columns, 4, &spans, &[1.0]);
         });
         assert!(column[3].abs() < 1e-6, "{:?}", &column[..4]);
     }
 
     #[test]
     fn missing_values_among_the_greatest_stay_finite() {
-        let mut column = [f32::MAX, f32::NAN, -f32::MAX, -f32::MAX, f32::NAN];
-        impute(&mut column);
+        let mut column = [0.0; LANES];
+        column[..5].copy_from_slice(&[f32::MAX, f32::NAN, -f32::MAX, -f32::MAX, f32::NAN]);
+        dispatch!(SimdLevel::default().level(), simd => impute(simd, &mut column, 5));
         assert!(column.iter().all(|v| v.is_finite()), "{column:?}");
     }
 

@@ -7,6 +7,8 @@ pub(crate) struct Dependencies {
     pub(crate) color_random: [f64; 3],
     /// D_ck^p: of each colour channel on the film position.
     pub(crate) color_position: [f64; 3],
+    /// D_ck^fl: of each colour channel on each feature.
+    pub(crate) color_features: [Vec<f64>; 3],
     /// D_c^fk: of all colour channels together on each feature.
     pub(crate) color_feature: Vec<f64>,
     /// D_fk^r: of each feature on all random parameters.
@@ -21,9 +23,27 @@ impl Dependencies {
         Self {
             color_random: [0.0; 3],
             color_position: [0.0; 3],
+            color_features: std::array::from_fn(|_| vec![0.0; features]),
             color_feature: vec![0.0; features],
             feature_random: vec![0.0; features],
             feature_position: vec![0.0; features],
+        }
+    }
+
+    /// Gives a colour channel the dependencies of one that is equal to it.
+    pub(crate) fn copy_color(&mut self, from: usize, to: usize) {
+        self.color_position[to] = self.color_position[from];
+        self.color_random[to] = self.color_random[from];
+        if let Ok([from, to]) = self.color_features.get_disjoint_mut([from, to]) {
+            to.copy_from_slice(from);
+        }
+    }
+
+    /// Adds up the colour channels' dependencies on each feature.
+    pub(crate) fn add_colors(&mut self) {
+        let [red, green, blue] = &self.color_features;
+        for (((sum, red), green), blue) in self.color_feature.iter_mut().zip(red).zip(green).zip(blue) {
+            *sum = red + green + blue;
         }
     }
 }
@@ -47,7 +67,7 @@ impl Weights {
 
     /// The weights of iteration `t`. A quotient with denominator 0 is 0.
     pub(crate) fn set(&mut self, dependencies: &Dependencies, t: usize) {
-        let Dependencies { color_random, color_position, color_feature, feature_random, feature_position } =
+        let Dependencies { color_random, color_position, color_feature, feature_random, feature_position, .. } =
             dependencies;
         let share = |part: f64, whole: f64| if whole == 0.0 { 0.0 } else { part / whole };
         let growth = 1.0 + 0.1 * t as f64;

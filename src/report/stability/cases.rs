@@ -248,7 +248,6 @@ fn features() -> Vec<Case> {
     };
     let overflow = |s: &mut Samples| {
         some(s.channel("color"), 11, 50, &[1e5, 7e4]);
-        s.planes.iter_mut().flatten().for_each(|v| *v = half::f16::from_f32(*v).to_f32());
     };
     let like = |s: &mut Samples, channel: &str, name: &str, role: Role, of: fn(f32) -> f32| {
         let plane = s.channel(channel)[0].iter().map(|&v| of(v)).collect();
@@ -281,6 +280,7 @@ fn features() -> Vec<Case> {
         Case::new("features-8-bit", Base::Image, few_values, move |s| {
             s.features().into_iter().for_each(|plane| quantise(plane, 255.0));
         }),
-        Case::new("f16-overflow", Base::Image, usual(Against::Median(0.25), "one sample in 50 becomes its pixel's mean, all others lose 13 bits"), overflow),
+        Case::new("f16-overflow", Base::Image, usual(Against::Median(0.25), "one sample in 50 becomes its pixel's mean, all others lose 13 bits"), overflow)
+            .over_the_wire_as_f16(),
     ]
 }

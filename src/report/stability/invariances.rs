@@ -47,28 +47,46 @@ pub(super) fn cases() -> Vec<Case> {
             }
             s.channels.reverse();
         }),
-        Case::new(
-            "mirrored",
-            Base::Image,
-            seeds("draws fall on other sides, and the grid's nodes lie elsewhere"),
-            mirror,
-        )
+        Case::new("colors-permuted", Base::Image, seeds("sums over the channels run in another order"), |s| {
+            if let [r, g, b] = &mut s.channel("color")[..] {
+                // R, G, B are what B, R, G were.
+                std::mem::swap(*r, *g);
+                std::mem::swap(*r, *b);
+            }
+        })
+        .back(Back::Rotated),
+        Case::new("mirrored", Base::Image, seeds(MOVED), |s| {
+            move_pixels(s, |x, y, [width, _]| (width - 1 - x, y));
+            let width = s.size[0] as f32;
+            s.channel("film")[0].iter_mut().for_each(|v| *v = width - *v);
+        })
         .back(Back::Mirrored),
+        Case::new("flipped", Base::Image, seeds(MOVED), |s| {
+            move_pixels(s, |x, y, [_, height]| (x, height - 1 - y));
+            let height = s.size[1] as f32;
+            s.channel("film")[1].iter_mut().for_each(|v| *v = height - *v);
+        })
+        .back(Back::Flipped),
+        Case::new("transposed", Base::Image, seeds(MOVED), |s| {
+            move_pixels(s, |x, y, _| (y, x));
+            if let [x, y] = &mut s.channel("film")[..] {
+                std::mem::swap(*x, *y);
+            }
+        })
+        .back(Back::Transposed),
     ]
 }
 
-/// Swaps left and right.
-fn mirror(s: &mut Samples) {
-    let width = s.size[0] as usize;
+const MOVED: &str = "draws fall on other sides, and the grid's nodes lie elsewhere";
+
+/// Brings to pixel (x, y) what was at `from(x, y, size)`.
+fn move_pixels(s: &mut Samples, from: impl Fn(usize, usize, [usize; 2]) -> (usize, usize)) {
+    let size = s.size.map(|side| side as usize);
     let order: Vec<usize> = (0..s.total())
         .map(|i| {
-            let (pixel, sample) = (i / 4, i % 4);
-            let (x, y) = (pixel % width, pixel / width);
-            4 * (y * width + width - 1 - x) + sample
+            let (x, y) = from(i / 4 % size[0], i / 4 / size[0], size);
+            4 * (y * size[0] + x) + i % 4
         })
         .collect();
     s.reorder(&order);
-    if let Some(x) = s.channel("film").first_mut() {
-        x.iter_mut().for_each(|v| *v = width as f32 - *v);
-    }
 }

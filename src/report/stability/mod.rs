@@ -27,7 +27,7 @@ pub use measure::Deviation;
 pub use run::{Lab, Outcome, Steps, Verdict};
 pub use samples::Base;
 
-use crate::filter::{Method, ParameterError};
+use crate::filter::{Method, ParameterError, SampleTile};
 use samples::Samples;
 
 /// Greatest deviation of a step: f32 columns are within 3e-5 deviations of the oracle's (a bound of its tests), and the
@@ -68,6 +68,12 @@ pub enum Back {
     Divided(f64),
     /// Left and right swapped.
     Mirrored,
+    /// Top and bottom swapped.
+    Flipped,
+    /// Rows and columns swapped, of a square image.
+    Transposed,
+    /// Channels moved on by one: R, G, B of the image are B, R, G of the clean one.
+    Rotated,
     /// The image is filtered in square tiles of so many pixels, with the halo that they need.
     Tiles(u32),
 }
@@ -125,6 +131,8 @@ pub struct Case {
     pub known: Option<&'static str>,
     /// Parameters set in every preset.
     settings: Vec<(&'static str, &'static str)>,
+    /// The samples come over the wire in half precision.
+    f16: bool,
     change: Box<dyn Fn(&mut Samples) + Send + Sync>,
 }
 
@@ -136,7 +144,16 @@ impl Case {
         change: impl Fn(&mut Samples) + Send + Sync + 'static,
     ) -> Self {
         let change = Box::new(change);
-        Self { name: name.into(), base, back: Back::Same, bounds, known: None, settings: Vec::new(), change }
+        Self {
+            name: name.into(),
+            base,
+            back: Back::Same,
+            bounds,
+            known: None,
+            settings: Vec::new(),
+            f16: false,
+            change,
+        }
     }
 
     fn back(self, back: Back) -> Self {
@@ -147,10 +164,20 @@ impl Case {
         Self { known: Some(known), ..self }
     }
 
+    fn over_the_wire_as_f16(self) -> Self {
+        Self { f16: true, ..self }
+    }
+
     fn samples(&self) -> Samples {
         let mut samples = self.base.samples();
         (self.change)(&mut samples);
         samples
+    }
+
+    /// The whole image as one tile, as it is when it is there.
+    fn tile(&self, samples: &Samples) -> SampleTile {
+        let tile = samples.whole();
+        if self.f16 { samples::over_the_wire_as_f16(&tile) } else { tile }
     }
 
     /// The method of a preset: `paper` with smaller boxes, so that the oracle is done with it.

@@ -4,7 +4,7 @@ use super::measure::{Deviation, Image};
 use super::samples::Samples;
 use super::{Against, Back, Base, Bounds, Case};
 use crate::filter::{
-    Execution, Method, SampleTile, Stopped, filter,
+    Execution, Method, SampleTile, SimdLevel, Stopped, filter,
     method::Algorithm,
     oracle::Whole,
     rpf::{Params, trace},
@@ -84,6 +84,7 @@ pub struct Outcome {
 /// Runs cases; keeps the clean images, which many share.
 #[derive(Default)]
 pub struct Lab {
+    simd: SimdLevel,
     clean: HashMap<(Base, String), Clean>,
 }
 
@@ -96,19 +97,24 @@ struct Clean {
 }
 
 impl Lab {
+    /// One that filters at this SIMD level.
+    pub fn new(simd: SimdLevel) -> Self {
+        Self { simd, ..Self::default() }
+    }
+
     /// Runs a case with a preset, one of [`PRESETS`](crate::filter::method::PRESETS).
     pub fn run(&mut self, case: &Case, preset: &str) -> Result<Outcome, Stopped> {
         let Ok(method) = case.method(preset) else { unreachable!("cases set parameters that there are") };
         let samples = case.samples();
-        let (tile, width) = (samples.whole(), samples.size[0] as usize);
-        let execution = Execution { seed: SEEDS[0], ..Execution::default() };
+        let (tile, width) = (case.tile(&samples), samples.size[0] as usize);
+        let execution = Execution { seed: SEEDS[0], simd: self.simd, ..Execution::default() };
         let filtered = filter(&tile, &method, &execution)?;
         let whole_image = image(&filtered.rgb);
         let fast = match case.back {
             Back::Tiles(size) => tiled(&samples, size, &method, &execution)?,
             _ => whole_image.clone(),
         };
-        let (oracle, steps) = against_oracle(&tile, &method, &case.bounds)?;
+        let (oracle, steps) = against_oracle(&tile, &method, &case.bounds, &execution)?;
         let energy = filtered.report.energy_out / filtered.report.energy_in;
         let energy_of_oracle = oracle.iter().flatten().sum::<f64>() / filtered.report.energy_in;
         let mut outcome = Outcome {
@@ -142,7 +148,7 @@ impl Lab {
         if !self.clean.contains_key(&key) {
             let samples = case.base.samples();
             let (tile, width) = (samples.whole(), samples.size[0] as usize);
-            let run = |seed| filter(&tile, method, &Execution { seed, ..Execution::default() });
+            let run = |seed| filter(&tile, method, &Execution { seed, simd: self.simd, ..Execution::default() });
             let (fast, other) = (image(&run(SEEDS[0])?.rgb), image(&run(SEEDS[1])?.rgb));
             let spread = Deviation::of(&other, &fast, width).rms;
             let oracle = oracle_image(&tile, method);
@@ -184,12 +190,16 @@ fn oracle_image(tile: &SampleTile, method: &Method) -> Image {
 }
 
 /// The oracle's own image, and how far the production path's iterations are from the oracle's.
-fn against_oracle(tile: &SampleTile, method: &Method, bounds: &Bounds) -> Result<(Image, Steps), Stopped> {
+fn against_oracle(
+    tile: &SampleTile,
+    method: &Method,
+    bounds: &Bounds,
+    execution: &Execution,
+) -> Result<(Image, Steps), Stopped> {
     let params = params(method);
     let whole = Whole::new(tile, &params, SEEDS[0]);
     let (mut colors, mut own) = (whole.colors(), whole.colors());
-    let execution = Execution { seed: SEEDS[0], ..Execution::default() };
-    let trace = if params.boxes.is_empty() { Vec::new() } else { trace(tile, &params, &execution)? };
+    let trace = if params.boxes.is_empty() { Vec::new() } else { trace(tile, &params, execution)? };
     let (mut steps, mut squares, mut compared) = (Steps::default(), 0.0, 0.0);
     for (t, fast) in trace.iter().enumerate() {
         let expected = whole.step(t, &colors);
@@ -233,6 +243,9 @@ impl Back {
             Self::Same | Self::Tiles(_) => {}
             Self::Divided(by) => image.iter_mut().flatten().for_each(|v| *v /= by),
             Self::Mirrored => image.chunks_exact_mut(width).for_each(<[_]>::reverse),
+            Self::Flipped => image = image.chunks_exact(width).rev().flatten().copied().collect(),
+            Self::Transposed => image = (0..image.len()).map(|i| image[i % width * width + i / width]).collect(),
+            Self::Rotated => image.iter_mut().for_each(|pixel| pixel.rotate_left(1)),
         }
         image
     }

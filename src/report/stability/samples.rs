@@ -4,6 +4,7 @@ use crate::filter::{
     Channel, ChannelSet, Counts, Execution, Halo, Plane, Rect, Role, SampleTile, TileGeometry, geometry::tiling,
 };
 use crate::synth::Scene;
+use crate::wire::{Assembler, Decoder, Format, Header, encode_tile};
 
 /// What a case starts from: crops of one small render, lens, motion, gloss and textures in it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -173,4 +174,19 @@ impl Samples {
         let Ok(tile) = SampleTile::new(geometry, channels, counts, planes) else { unreachable!("cases fit") };
         tile
     }
+}
+
+/// A tile as it arrives if it was sent in half precision: what is beyond 65504 is infinite on the way.
+pub(super) fn over_the_wire_as_f16(tile: &SampleTile) -> SampleTile {
+    let Ok(header) = Header::of(tile, Format::F16) else { unreachable!("cases fit into a tile") };
+    let mut bytes = Vec::new();
+    if encode_tile(&header, tile, &mut bytes).is_err() {
+        unreachable!("the header is the tile's, and memory takes all")
+    }
+    let (mut decoder, mut input, mut assembler) = (Decoder::new(), &bytes[..], Assembler::new(&header));
+    while let Ok(Some(event)) = decoder.next(&mut input) {
+        assembler.push(&event);
+    }
+    let Ok(arrived) = assembler.finish() else { unreachable!("what was encoded decodes") };
+    arrived
 }

@@ -5,10 +5,11 @@ use super::{is_feature, method, scene};
 use crate::filter::lanes::{SimdLevel, dispatch};
 use crate::filter::method::Algorithm;
 use crate::filter::oracle::{self, Columns, Whole};
-use crate::filter::rpf::iteration::{ColumnOrder, Pass, Scratch};
+use crate::filter::rpf::block::ColumnOrder;
+use crate::filter::rpf::iteration::{Pass, Scratch};
 use crate::filter::rpf::neighborhood::Offsets;
 use crate::filter::rpf::relevance::{Relevant, Source};
-use crate::filter::rpf::{Params, draws, information, interleaved_colors, most_rows, spikes};
+use crate::filter::rpf::{Params, draws, information, interleaved_colors, room, spikes};
 use crate::filter::{ChannelSet, Counts, Execution, Rect, Role, SampleTile, TileGeometry};
 use crate::synth::Scene;
 
@@ -53,9 +54,12 @@ fn params(preset: &str, settings: &[(&str, &str)]) -> Params {
 /// Runs `compare` at some pixels of a noisy scene, in each iteration, with all that a pass has.
 fn at_pixels(params: &Params, tile: &SampleTile, mut compare: impl FnMut(&Pass, &mut Scratch, u32, u32)) {
     let relevant = Relevant::of(tile, true);
-    let rows = most_rows(params, tile.max_per_pixel() as usize);
-    let (terms, colors) = (information::entropy_terms(rows), interleaved_colors(tile));
-    let mut scratch = Scratch::new(&relevant, rows, params.bins, true);
+    let mut room = room(tile.geometry(), params, tile.total() as u64, tile.max_per_pixel(), tile.varying());
+    // The whole image as one block, so that records are numbered like the tile's samples.
+    let window = tile.geometry().window();
+    (room.pixels, room.samples) = (window.area() as usize, tile.total());
+    let (terms, colors) = (information::entropy_terms(room.rows), interleaved_colors(tile));
+    let mut scratch = Scratch::new(tile, &relevant, params, &room, true);
     for t in 0..params.boxes.len() {
         let offsets = Offsets::new(params.boxes[t]);
         let execution = Execution { seed: 3, ..Execution::default() };
@@ -67,9 +71,10 @@ fn at_pixels(params: &Params, tile: &SampleTile, mut compare: impl FnMut(&Pass, 
             execution: &execution,
             offsets,
             terms: &terms,
+            settled: &[],
             colors: &colors,
         };
-        let window = tile.geometry().window();
+        dispatch!(SimdLevel::default().level(), simd => pass.load(simd, &mut scratch, &window, true));
         for y in (0..window.height).step_by(5) {
             for x in (0..window.width).step_by(7) {
                 compare(&pass, &mut scratch, x, y);
@@ -88,7 +93,7 @@ fn cases() -> Vec<(Params, SampleTile)> {
 
 /// The neighbourhood's raw columns, as the oracle takes them.
 fn raw_columns(pass: &Pass, scratch: &Scratch) -> Columns {
-    let samples = &scratch.rows.samples;
+    let samples = scratch.rows();
     let plane = |plane: usize| samples.iter().map(|&s| f64::from(pass.tile.value(plane, s as usize))).collect();
     let positions = pass.relevant.positions().iter().map(|source| match source {
         Source::Plane(p) => plane(*p),
@@ -104,14 +109,16 @@ fn raw_columns(pass: &Pass, scratch: &Scratch) -> Columns {
 }
 
 /// The fast path's normalised columns.
-fn fast_columns(pass: &Pass, scratch: &Scratch) -> Columns {
-    let (order, rows) = (ColumnOrder::of(pass.relevant), scratch.rows.samples.len());
-    let column = |c: usize| f64s(&scratch.columns[c * scratch.stride..][..rows]);
+fn fast_columns(pass: &Pass, scratch: &mut Scratch) -> Columns {
+    let (order, rows) = (ColumnOrder::of(pass.relevant), scratch.rows().len());
+    let mut columns = |columns: std::ops::Range<usize>| {
+        columns.map(|column| f64s(&scratch.columns([column])[0][..rows])).collect::<Vec<_>>()
+    };
     Columns {
-        positions: (0..order.random).map(column).collect(),
-        random: (order.random..order.features).map(column).collect(),
-        features: (order.features..order.colors).map(column).collect(),
-        colors: (order.colors..order.end).map(column).collect(),
+        positions: columns(order.positions),
+        random: columns(order.random),
+        features: columns(order.features),
+        colors: columns(order.colors),
     }
 }
 
@@ -135,11 +142,11 @@ fn neighbourhoods_accept_the_same_candidates() {
             .map(|(plane, (channel, _))| (plane, channel.role == Role::Feature { position: true }))
             .collect();
         at_pixels(&params, &tile, |pass, scratch, x, y| {
-            assert!(pass.gather(scratch, x, y));
+            assert!(dispatch!(SimdLevel::default().level(), simd => pass.gather(simd, scratch, x, y)));
             let window = tile.geometry().window();
             let own = tile.samples_of(window.index(x, y));
-            let mut fast = scratch.rows.samples[own.len()..].iter().copied().peekable();
-            for (_, sample) in draws(&tile, &params, pass.execution.seed, pass.t, x, y) {
+            let mut fast = scratch.rows()[own.len()..].iter().copied().peekable();
+            for (_, sample) in draws(&pass.offsets, &tile, &params, pass.execution.seed, pass.t, x, y) {
                 let sample = sample as u32;
                 let (mut accepted, mut margin) = (true, f64::INFINITY);
                 for &(plane, position) in &features {
@@ -291,13 +298,20 @@ fn whole_images_agree() {
         ("holes", scene("all").tile_varying(in_a_corner(3), 2, &Execution::default()).unwrap()),
         ("no film", without_film(&super::scene("glossy", [9, 30], 4))),
     ] {
-        for settings in [[("information_grid", "1"), ("spikes", "on")], [("information_grid", "4"), ("spikes", "off")]]
-        {
+        for settings in [
+            [("information_grid", "1"), ("spikes", "on"), ("tolerance", "0")],
+            [("information_grid", "4"), ("spikes", "off"), ("tolerance", "0")],
+            [("information_grid", "4"), ("spikes", "on"), ("tolerance", "0.05")],
+        ] {
             let method = method("lean", &settings);
             let Algorithm::Rpf(params) = method.algorithm() else { unreachable!("lean is RPF") };
             let execution = Execution { seed: 9, ..Execution::default() };
-            let fast = crate::filter::filter(&tile, &method, &execution).unwrap().rgb;
+            let fast = crate::filter::filter(&tile, &method, &execution).unwrap();
             let expected = Whole::new(&tile, params, 9).image();
+            if params.tolerance > 0.0 {
+                println!("{what}: {} of {} pixels settled", fast.report.settled, expected.len());
+            }
+            let fast = fast.rgb;
             let mut far = 0;
             for (pixel, expected) in expected.iter().enumerate() {
                 let differs =
@@ -306,6 +320,37 @@ fn whole_images_agree() {
             }
             println!("{what}, {settings:?}: {far} of {} pixels differ by more than 1e-4", expected.len());
             assert!(far * 10 < expected.len(), "{what}: {far} of {} pixels differ", expected.len());
+        }
+    }
+}
+
+/// The scalar path, against which speed is measured, computes the same: pixels differ by more only where a decision fell
+/// the other way in f32, which is rare but is seen in all that reads such a pixel.
+#[test]
+fn the_scalar_path_computes_the_same() {
+    let in_a_corner = TileGeometry::with_halo([40, 30], Rect::new(0, 4, 12, 10), 9).unwrap();
+    let small = [("boxes", "15,9,7"), ("fractions", "0.1,0.2,0.5")];
+    for (what, tile) in [
+        ("image", scene("all", [24, 20], 8)),
+        ("holes", Scene::by_name("all").unwrap().tile_varying(in_a_corner, 6, &Execution::default()).unwrap()),
+        ("no film", without_film(&scene("glossy", [20, 20], 4))),
+    ] {
+        for (preset, settings) in [("lean", &[][..]), ("paper-fast", &small), ("lean", &[("bins", "9")])] {
+            let (method, params) = (method(preset, settings), params(preset, settings));
+            let fast = crate::filter::filter(&tile, &method, &Execution { seed: 9, ..Execution::default() }).unwrap();
+            let scalar = crate::filter::scalar::filter(&tile, &params, 9).unwrap();
+            assert_eq!((fast.report.filled, fast.core), (scalar.report.filled, scalar.core));
+            let (mut far, mut squares, mut size) = (0, 0.0, 0.0);
+            let pixels = fast.rgb[0].len();
+            for pixel in 0..pixels {
+                let values = [0, 1, 2].map(|k| (f64::from(fast.rgb[k][pixel]), f64::from(scalar.rgb[k][pixel])));
+                far += usize::from(values.iter().any(|(a, b)| (a - b).abs() > 1e-4 * b.max(0.01)));
+                squares += values.iter().map(|(a, b)| (a - b) * (a - b)).sum::<f64>();
+                size += values.iter().map(|(_, b)| b * b).sum::<f64>();
+            }
+            let rms = (squares / size).sqrt();
+            println!("{what}, {preset} {settings:?}: {far} of {pixels} pixels differ by more than 1e-4, RMS {rms:.1e}");
+            assert!(far * 10 < pixels && rms < 0.01, "{what}, {preset}: {far} of {pixels}, RMS {rms:e}");
         }
     }
 }

@@ -4,8 +4,8 @@ use super::{method, part, scene};
 use crate::filter::geometry::tiling;
 use crate::filter::method::{Algorithm, PRESETS};
 use crate::filter::{
-    Channel, ChannelSet, Counts, Execution, Filtered, Halo, LeftOut, LeftOutReason, Method, Plane, Rect, Role,
-    SampleTile, SimdLevel, Stopped, TileGeometry, filter,
+    Channel, ChannelSet, Counts, Execution, Filtered, Halo, LeftOut, LeftOutReason, Method, Plane, Rect, Report, Role,
+    SampleTile, SimdLevel, Stopped, TileGeometry, Work, filter,
 };
 use crate::synth::Scene;
 use std::sync::atomic::AtomicBool;
@@ -16,12 +16,13 @@ fn run(tile: &SampleTile, method: &Method) -> Filtered {
 
 /// The methods that tiling and threads are tried with: presets as they are where their reach fits a small image, else
 /// with smaller boxes; and the baselines.
-fn methods() -> [Method; 7] {
+fn methods() -> [Method; 8] {
     let small = [("boxes", "15,9,7,5"), ("fractions", "0.05,0.1,0.3,0.5")];
     [
         method("lean", &[]),
         method("paper-fast", &small),
         method("paper-fast", &[small[0], small[1], ("spikes", "off"), ("information_grid", "3")]),
+        method("lean", &[("tolerance", "0.02")]),
         method("gaussian", &[("sigma", "2.5")]),
         method("bilateral", &[("sigma", "3"), ("color_scale", "linear")]),
         method("bilateral", &[("color_scale", "log"), ("color_sigma", "0.3")]),
@@ -106,6 +107,31 @@ fn threads_and_simd_levels_do_not_matter() {
     assert_ne!(other.rgb, run(&tile, &methods()[0]).rgb, "the seed matters");
 }
 
+/// Every preset as it is, at every level there is, with holes, and with and without what could be left out.
+#[test]
+fn simd_levels_do_not_matter_to_any_preset() {
+    let geometry = TileGeometry::with_halo([40, 30], Rect::new(8, 4, 12, 9), 6).unwrap();
+    let tile = Scene::by_name("all").unwrap().tile_varying(geometry, 5, &Execution::default()).unwrap();
+    let levels = SimdLevel::available();
+    println!("levels of this CPU: {}", SimdLevel::names().join(", "));
+    for (preset, _) in PRESETS {
+        for leave_out in [true, false] {
+            let at = |simd| {
+                let execution = Execution { seed: 5, simd, leave_out, ..Execution::default() };
+                filter(&tile, &method(preset, &[]), &execution).unwrap()
+            };
+            let expected = at(levels[0].1);
+            for (name, level) in &levels[1..] {
+                let filtered = at(*level);
+                for (plane, expected) in filtered.rgb.iter().zip(&expected.rgb) {
+                    assert!(bits(plane) == bits(expected), "{preset} at {name}, leaving out: {leave_out}");
+                }
+                assert_eq!(filtered.report, expected.report, "{preset} at {name}");
+            }
+        }
+    }
+}
+
 #[test]
 fn constant_colour_stays_exactly() {
     for (preset, _) in PRESETS {
@@ -170,6 +196,65 @@ fn planes_without_effect_change_no_bit() {
     }
 }
 
+/// What was done and what was left out is together what there is to do, which is done without leaving out.
+fn check_work(on: &Report, off: &Report, samples: usize) {
+    assert_eq!(on.left_out_bytes as usize, on.left_out.len() * samples * 4);
+    let (Some(on), Some(off)) = (on.work, off.work) else {
+        return assert_eq!((on.work, off.work), (None, None));
+    };
+    assert_eq!((off.saved(), off.saved_share()), (0, 0.0));
+    assert_eq!(on.done + on.saved(), off.done);
+    assert!(on.saved() > 0 && on.done > 0 && (0.0..1.0).contains(&on.saved_share()), "{on:?}");
+}
+
+/// Each cause of leaving out saves its own, and the work of tiles adds up to that of the whole image.
+#[test]
+fn work_is_told_by_cause_and_adds_up() {
+    let image = [40, 30];
+    let geometry = |core, halo| TileGeometry::with_halo(image, core, halo).unwrap();
+    let whole = Rect::new(0, 0, 40, 30);
+    for settings in [&[][..], &[("information_grid", "1")]] {
+        let method = method("lean", settings);
+        let work = |core: Rect, plane: &dyn Fn(usize, &SampleTile) -> Plane| {
+            let full = part("all", geometry(core, method.reach(false)), 3);
+            let planes = (0..full.channels().planes()).map(|k| plane(k, &full)).collect();
+            let tile = SampleTile::new(*full.geometry(), full.channels().clone(), Counts::Uniform(3), planes).unwrap();
+            run(&tile, &method).report.work.unwrap()
+        };
+        let as_it_is = |k: usize, tile: &SampleTile| tile.plane(k).clone();
+        let plain = work(whole, &as_it_is);
+        assert_eq!(plain.planes, 0, "nothing is constant all over");
+        // A random parameter that is constant all over; one that is a step at the right edge, so over most neighbourhoods;
+        // a colour that is one, too, and so depends on it alone and weighs nothing.
+        let time = scene("all", [8, 8], 1).channels().planes_of(|role| matches!(role, Role::Random { .. }))[0];
+        let constant = |k: usize, tile: &SampleTile| match k {
+            k if k == time => Plane::Constant(0.5),
+            k => tile.plane(k).clone(),
+        };
+        let step = |k: usize, tile: &SampleTile| match k {
+            k if k == time => {
+                let last = |s: usize| s / 3 % tile.geometry().window().width as usize == 39;
+                Plane::Values((0..tile.total()).map(|s| f32::from(last(s))).collect())
+            }
+            k => tile.plane(k).clone(),
+        };
+        let noise = |k: usize, tile: &SampleTile| match k {
+            k if tile.channels().color_planes().contains(&k) => {
+                Plane::Values((0..tile.total()).map(|s| tile.value(time, s) * k as f32).collect())
+            }
+            k => tile.plane(k).clone(),
+        };
+        let (constant, step, noise) = (work(whole, &constant), work(whole, &step), work(whole, &noise));
+        assert!(constant.planes > 0, "{constant:?}");
+        assert!(step.planes == 0 && step.columns > plain.columns && step.distances > 0, "{plain:?} {step:?}");
+        assert!(noise.distances > plain.distances, "{plain:?} {noise:?}");
+        let mut sum = Work::default();
+        tiling(image, 16).for_each(|core| sum += work(core, &as_it_is));
+        assert_eq!(sum.done + sum.saved(), plain.done + plain.saved());
+        assert_eq!(sum.distances, plain.distances);
+    }
+}
+
 /// Computing what can have no effect changes no bit: constant and missing planes of every role, columns that are constant
 /// over a neighbourhood only, features and colours that weigh nothing. Random planes come and go, and so do threads.
 #[test]
@@ -207,8 +292,54 @@ fn leaving_out_changes_no_bit() {
                 assert_eq!(on.report.spikes, off.report.spikes);
                 let unused = |l: &LeftOut| l.reason == LeftOutReason::Unused;
                 assert!(off.report.left_out.iter().all(unused), "{:?}", off.report.left_out);
+                check_work(&on.report, &off.report, tile.total());
                 let constant = |r: &Filtered| r.report.left_out.iter().any(|l| !unused(l));
                 assert!(!constant(&off) && (constant(&on) || !matches!(method.algorithm(), Algorithm::Rpf(_))));
+            }
+        }
+    }
+}
+
+/// Colour channels that are equal are computed once, for the bits of computing each: all three, as in a grey scene, or
+/// any two; among them constant ones, missing features, and pixels with different numbers of samples.
+#[test]
+fn equal_colours_are_computed_once() {
+    let geometry = TileGeometry::new([26, 22], Rect::new(0, 0, 26, 22), Halo::default()).unwrap();
+    let fixed = scene("all", [26, 22], 3);
+    let varying = Scene::by_name("all").unwrap().tile_varying(geometry, 4, &Execution::default()).unwrap();
+    for (noisy, counts) in [
+        (&fixed, Counts::Uniform(3)),
+        (&varying, Counts::Varying((0..26 * 22).map(|p| varying.samples_of(p).len() as u16).collect())),
+    ] {
+        let colors = noisy.channels().color_planes();
+        for (sources, equal) in [
+            ([0, 0, 0], &["color.1", "color.2"][..]),
+            ([1, 1, 2], &["color.1"]),
+            ([0, 1, 0], &["color.2"]),
+            ([2, 1, 1], &["color.2"]),
+            ([0, 1, 2], &[]),
+        ] {
+            let plane = |plane: usize| match colors.iter().position(|&color| color == plane) {
+                Some(channel) => noisy.plane(colors[sources[channel]]).clone(),
+                None => noisy.plane(plane).clone(),
+            };
+            let planes = (0..noisy.channels().planes()).map(plane).collect();
+            let tile = SampleTile::new(*noisy.geometry(), noisy.channels().clone(), counts.clone(), planes).unwrap();
+            for method in methods() {
+                let on = run(&tile, &method);
+                let execution = Execution { seed: 5, leave_out: false, ..Execution::default() };
+                let off = filter(&tile, &method, &execution).unwrap();
+                assert!(on.rgb.iter().zip(&off.rgb).all(|(on, off)| bits(on) == bits(off)), "{sources:?}, {method:?}");
+                assert_eq!(on.report.spikes, off.report.spikes);
+                for (k, l) in [(0, 1), (0, 2), (1, 2)] {
+                    assert_eq!(sources[k] == sources[l], bits(&on.rgb[k]) == bits(&on.rgb[l]));
+                }
+                let said = on.report.left_out.iter().filter(|l| l.reason == LeftOutReason::Equal);
+                let said: Vec<_> = said.map(|l| l.plane.as_str()).collect();
+                let rpf = matches!(method.algorithm(), Algorithm::Rpf(_));
+                assert_eq!(said, if rpf { equal } else { &[] });
+                check_work(&on.report, &off.report, tile.total());
+                assert!(off.report.left_out.iter().all(|l| l.reason == LeftOutReason::Unused));
             }
         }
     }
@@ -296,14 +427,53 @@ fn partly_missing_features_give_the_whole_images_bits() {
     }
 }
 
+/// With a tolerance the pixels that filtering could help little stay exactly as they are, and are counted; 0 is as
+/// without. What nodes only settled pixels would ask for is not computed: there is less work.
+#[test]
+fn settled_pixels_are_passed_through() {
+    let tile = scene("all", [40, 30], 6);
+    for preset in ["lean", "paper-fast"] {
+        let settings = [("boxes", "15,9,7,5"), ("fractions", "0.05,0.1,0.3,0.5")];
+        let settings: &[_] = if preset == "lean" { &[] } else { &settings };
+        let with = |tolerance| {
+            let settings: Vec<_> = settings.iter().copied().chain([("tolerance", tolerance)]).collect();
+            run(&tile, &method(preset, &settings))
+        };
+        let plain = run(&tile, &method(preset, settings));
+        assert_eq!(with("0"), plain);
+        assert_eq!((plain.report.settled, plain.report.settled_error), (0, 0.0));
+        let before = run(&tile, &method("unfiltered", &[]));
+        let (mut last, mut work) = (0, plain.report.work.unwrap().done);
+        for (tolerance, limit) in [("0.001", 0.001), ("0.03", 0.03), ("1", 1.0)] {
+            let filtered = with(tolerance);
+            let Report { settled, settled_error, .. } = filtered.report;
+            let same = (0..40 * 30).filter(|&p| (0..3).all(|k| filtered.rgb[k][p] == before.rgb[k][p])).count() as u64;
+            assert!(settled >= last && same >= settled, "{settled} settled, {same} the same, {last} before");
+            assert!(settled_error >= 0.0 && (settled_error < limit * settled as f64 || settled == 0));
+            let done = filtered.report.work.unwrap().done;
+            assert!(done <= work, "{done} {work}");
+            assert!(tolerance != "0.03" || settled > 100 && settled < 40 * 30, "{settled}");
+            (last, work) = (settled, done);
+        }
+    }
+    // One sample says nothing of its noise; without any there is nothing to pass through.
+    let one = run(&scene("all", [20, 14], 1), &method("lean", &[("tolerance", "1")]));
+    assert_eq!(one.report.settled, 0);
+    let none = without_samples(16);
+    assert_eq!(run(&none, &method("lean", &[("tolerance", "1")])).report.settled, 0);
+}
+
 /// Hole filling looks no further than it has to: this would take hours if it did.
 #[test]
 fn an_empty_tile_is_quick_whatever_the_box() {
     let method = method("lean", &[("boxes", "255"), ("fractions", "0")]);
-    let geometry = TileGeometry::with_halo([512, 512], Rect::new(0, 0, 512, 512), 0).unwrap();
+    assert_eq!(run(&without_samples(512), &method).report.unfilled, 512 * 512);
+}
+
+fn without_samples(side: u32) -> SampleTile {
+    let geometry = TileGeometry::with_halo([side, side], Rect::new(0, 0, side, side), 0).unwrap();
     let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
-    let tile = SampleTile::new(geometry, channels, Counts::Uniform(0), vec![Plane::Constant(0.0); 3]).unwrap();
-    assert_eq!(run(&tile, &method).report.unfilled, 512 * 512);
+    SampleTile::new(geometry, channels, Counts::Uniform(0), vec![Plane::Constant(0.0); 3]).unwrap()
 }
 
 /// The plainest tiles there are: no film, no features, no random parameters; one or no sample; one pixel.

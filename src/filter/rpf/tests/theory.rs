@@ -4,7 +4,7 @@ use crate::filter::lanes::{LANES, SimdLevel, dispatch, padded};
 use crate::filter::rpf::information::{Histograms, entropy_terms};
 use crate::filter::rpf::neighborhood::{Center, Offsets, candidate, offset_probabilities, pick_sample};
 use crate::filter::rpf::random::{bits, pixel_key};
-use crate::filter::rpf::statistics::{normalise, pad, span};
+use crate::filter::rpf::statistics::{make_safe, normalise, pad};
 use crate::filter::{Rect, oracle};
 
 const BINS: u32 = 7;
@@ -24,11 +24,11 @@ fn information(x: &[f32], y: &[f32]) -> f64 {
             let mut values = values.to_vec();
             values.resize(padded(n), 0.0);
             pad(&mut values, n);
-            let span = span(simd, &values);
-            normalise(simd, &mut values, n, &span);
-            histograms.set(simd, column, &values, span.constant(), &terms);
+            let spans = make_safe(simd, &mut [&mut values[..]]);
+            normalise(simd, &mut [&mut values[..]], n, &spans, &[1.0]);
+            histograms.set(simd, column, &values, spans[0].constant(), &terms);
         }
-        histograms.information(0, 1, &terms)
+        histograms.information(simd, 0, &(1..2), &terms)[0]
     })
 }
 
@@ -116,8 +116,8 @@ fn normalising_holds_for_every_size() {
                 values.resize(padded(n), 0.0);
                 pad(&mut values, n);
                 dispatch!(simd.level(), simd => {
-                    let span = span(simd, &values);
-                    normalise(simd, &mut values, n, &span);
+                    let spans = make_safe(simd, &mut [&mut values[..]]);
+                    normalise(simd, &mut [&mut values[..]], n, &spans, &[1.0]);
                 });
                 for (value, expected) in values[..n].iter().zip(&expected) {
                     let difference = (f64::from(*value) - expected).abs();
@@ -192,7 +192,7 @@ fn padding_does_not_count() {
         let mut values = uniform(3, n);
         values.resize(padded(n) + LANES, 99.0);
         pad(&mut values[..padded(n)], n);
-        let span = dispatch!(SimdLevel::default().level(), simd => span(simd, &values[..padded(n)]));
+        let [span] = dispatch!(SimdLevel::default().level(), simd => make_safe(simd, &mut [&mut values[..padded(n)]]));
         let least = values[..n].iter().copied().fold(f32::MAX, f32::min);
         let greatest = values[..n].iter().copied().fold(f32::MIN, f32::max);
         assert_eq!((span.min, span.max), (least, greatest));

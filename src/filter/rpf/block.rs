@@ -1,0 +1,262 @@
+//! The samples around a block of pixels, record by record: what a row of a neighbourhood needs lies together.
+//!
+//! A tile keeps planes, one after another; a neighbourhood reads single samples of all of them, from all over its box.
+//! So a thread copies what a block of pixels can reach into records of whole cache lines, small enough to stay in the
+//! cache while the block is worked on: a candidate is tested, and a row gathered, from one or two lines of memory.
+
+use super::relevance::{Relevant, Source};
+use crate::filter::lanes::{LANES, Lanes, Simd, prelude::*, transpose};
+use crate::filter::samples::SampleLayout;
+use crate::filter::{Plane, Rect, SampleTile};
+
+/// One cache line of a record: a value of each of 16 columns.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(align(64))]
+pub(crate) struct Line(pub(crate) [f32; LANES]);
+
+/// Columns of a neighbourhood, by role. Features, and positions and random parameters together, fill whole lines.
+#[derive(Clone, Debug)]
+pub(crate) struct ColumnOrder {
+    pub(super) features: std::ops::Range<usize>,
+    pub(super) positions: std::ops::Range<usize>,
+    pub(super) random: std::ops::Range<usize>,
+    pub(super) colors: std::ops::Range<usize>,
+}
+
+impl ColumnOrder {
+    pub(super) fn of(relevant: &Relevant) -> Self {
+        Self::new(relevant.features().len(), relevant.positions().len(), relevant.random().len())
+    }
+
+    /// The order of so many columns of each role.
+    pub(super) const fn new(features: usize, positions: usize, random: usize) -> Self {
+        let first = features.next_multiple_of(LANES);
+        let second = first + positions;
+        let colors = (second + random).next_multiple_of(LANES);
+        Self {
+            features: 0..features,
+            positions: first..second,
+            random: second..second + random,
+            colors: colors..colors + 3,
+        }
+    }
+
+    /// Lines of the features of one sample.
+    pub(super) const fn feature_lines(&self) -> usize {
+        self.positions.start / LANES
+    }
+
+    /// Lines of the positions and random parameters of one sample.
+    pub(super) const fn other_lines(&self) -> usize {
+        (self.colors.start - self.positions.start) / LANES
+    }
+
+    /// Columns in all, those between included that only fill lines.
+    pub(super) const fn columns(&self) -> usize {
+        self.colors.end
+    }
+}
+
+/// The samples of a rectangle of pixels.
+#[derive(Debug)]
+pub(crate) struct Block {
+    /// The pixels, in image coordinates.
+    window: Rect,
+    layout: SampleLayout,
+    feature_lines: usize,
+    other_lines: usize,
+    /// Of each sample, its features.
+    features: Vec<Line>,
+    /// Of each sample, positions and random parameters.
+    others: Vec<Line>,
+    /// Of each sample R, G, B, and a 0.
+    colors: Vec<[f32; 4]>,
+}
+
+impl Block {
+    /// Room for so many pixels with so many samples of a tile.
+    pub(crate) fn with_capacity(pixels: usize, samples: usize, tile: &SampleTile, order: &ColumnOrder) -> Self {
+        let (feature_lines, other_lines) = (order.feature_lines(), order.other_lines());
+        Self {
+            window: Rect::new(0, 0, 0, 0),
+            layout: tile.layout().with_capacity(pixels),
+            feature_lines,
+            other_lines,
+            features: Vec::with_capacity(samples * feature_lines),
+            others: Vec::with_capacity(samples * other_lines),
+            colors: Vec::with_capacity(samples),
+        }
+    }
+
+    /// Bytes that [`Block::with_capacity`] allocates.
+    pub(crate) const fn bytes(pixels: usize, samples: usize, varying: bool, order: &ColumnOrder) -> u64 {
+        let lines = order.feature_lines() + order.other_lines();
+        let starts = if varying { (pixels + 1) * size_of::<u32>() } else { 0 };
+        (samples * (lines * size_of::<Line>() + size_of::<[f32; 4]>()) + starts) as u64
+    }
+
+    /// The pixels whose samples are here.
+    pub(crate) const fn window(&self) -> &Rect {
+        &self.window
+    }
+
+    /// The records of a pixel's samples.
+    #[inline(always)]
+    pub(crate) fn samples_of(&self, x: u32, y: u32) -> std::ops::Range<usize> {
+        self.layout.of(self.window.index(x, y))
+    }
+
+    /// Where each pixel's records lie, by its row-major index in the window.
+    #[inline(always)]
+    pub(crate) const fn layout(&self) -> &SampleLayout {
+        &self.layout
+    }
+
+    /// The features of all samples, [`Block::feature_lines`] each.
+    #[inline(always)]
+    pub(crate) fn features(&self) -> &[Line] {
+        &self.features
+    }
+
+    /// Lines of features per sample.
+    #[inline(always)]
+    pub(crate) const fn feature_lines(&self) -> usize {
+        self.feature_lines
+    }
+
+    /// Copies the samples of `window`, a part of the tile's data window; positions and random parameters only if they
+    /// are wanted. `colors` are those of the tile's samples, R, G, B next to each other.
+    #[inline(always)]
+    pub(crate) fn load<S: Simd>(
+        &mut self,
+        simd: S,
+        tile: &SampleTile,
+        relevant: &Relevant,
+        colors: &[f32],
+        window: Rect,
+        others: bool,
+    ) {
+        self.window = window;
+        tile.set_layout_of(&window, &mut self.layout);
+        let total = self.layout.total();
+        self.features.resize(total * self.feature_lines, Line::default());
+        self.colors.resize(total, [0.0; 4]);
+        let others_wanted = if others { total * self.other_lines } else { 0 };
+        self.others.resize(others_wanted, Line::default());
+        let whole = tile.geometry().window();
+        for y in window.y..window.bottom() {
+            let at = |x: u32| tile.samples_of(whole.index(x, y));
+            let (from, to) = (at(window.x).start, at(window.right() - 1).end);
+            let first = self.samples_of(window.x, y).start;
+            let samples = from..to;
+            for (place, color) in
+                self.colors[first..][..samples.len()].iter_mut().zip(colors[3 * from..3 * to].chunks_exact(3))
+            {
+                place[..3].copy_from_slice(color);
+            }
+            let features = relevant.features().iter().map(|f| Source::Plane(f.plane));
+            copy_row(simd, tile, features, samples.clone(), self.feature_lines, &mut self.features, first);
+            if others {
+                let random = relevant.random().iter().map(|&plane| Source::Plane(plane));
+                let sources = relevant.positions().iter().copied().chain(random);
+                copy_row(simd, tile, sources, samples, self.other_lines, &mut self.others, first);
+                self.centers(relevant, y);
+            }
+        }
+    }
+
+    /// Sets the positions of a row of pixels to the pixels' centres, where no film positions were sent.
+    fn centers(&mut self, relevant: &Relevant, y: u32) {
+        for (lane, source) in relevant.positions().iter().enumerate() {
+            if matches!(source, Source::Plane(_)) {
+                continue;
+            }
+            for x in self.window.x..self.window.right() {
+                let center = if *source == Source::CenterX { x } else { y } as f32 + 0.5;
+                for sample in self.samples_of(x, y) {
+                    self.others[sample * self.other_lines].0[lane] = center;
+                }
+            }
+        }
+    }
+
+    /// R, G and B of some samples, as columns.
+    #[inline(always)]
+    pub(crate) fn gather_colors(&self, rows: &[u32], [red, green, blue]: [&mut [f32]; 3]) {
+        for (((row, red), green), blue) in rows.iter().zip(red).zip(green).zip(blue) {
+            [*red, *green, *blue, _] = self.colors[*row as usize];
+        }
+    }
+
+    /// The features of some samples as columns: lane `l` of line `i` becomes column `16 i + l`, `stride` values apart.
+    /// The number of rows is a whole number of lanes.
+    #[inline(always)]
+    pub(crate) fn gather_features<S: Simd>(&self, simd: S, rows: &[u32], columns: &mut [f32], stride: usize) {
+        gather_columns(simd, &self.features, self.feature_lines, rows, columns, stride);
+    }
+
+    /// The same of positions and random parameters.
+    #[inline(always)]
+    pub(crate) fn gather_others<S: Simd>(&self, simd: S, rows: &[u32], columns: &mut [f32], stride: usize) {
+        gather_columns(simd, &self.others, self.other_lines, rows, columns, stride);
+    }
+}
+
+/// Copies what `sources` have of a run of samples into records, from the record `first` on.
+#[inline(always)]
+fn copy_row<S: Simd>(
+    simd: S,
+    tile: &SampleTile,
+    sources: impl Iterator<Item = Source>,
+    samples: std::ops::Range<usize>,
+    lines: usize,
+    records: &mut [Line],
+    first: usize,
+) {
+    let mut sources = sources.map(|source| match source {
+        Source::Plane(plane) => tile.plane(plane),
+        Source::CenterX | Source::CenterY => &Plane::Constant(0.0),
+    });
+    for line in 0..lines {
+        let mut planes = [&Plane::Constant(0.0); LANES];
+        planes.iter_mut().zip(&mut sources).for_each(|(place, plane)| *place = plane);
+        for start in samples.clone().step_by(LANES) {
+            let count = LANES.min(samples.end - start);
+            let mut values = [Lanes::splat(simd, 0.0); LANES];
+            for (place, plane) in values.iter_mut().zip(planes) {
+                *place = match plane {
+                    Plane::Constant(value) => Lanes::splat(simd, *value),
+                    Plane::Values(values) if count == LANES => Lanes::from_slice(simd, &values[start..start + LANES]),
+                    Plane::Values(values) => {
+                        let mut few = [0.0; LANES];
+                        few[..count].copy_from_slice(&values[start..start + count]);
+                        Lanes::from_slice(simd, &few)
+                    }
+                };
+            }
+            transpose(&mut values);
+            let place = records[(first + start - samples.start) * lines + line..].iter_mut().step_by(lines);
+            for (record, value) in place.zip(&values[..count]) {
+                value.store_slice(&mut record.0);
+            }
+        }
+    }
+}
+
+/// Records as columns, 16 rows by 16 columns at a time.
+#[inline(always)]
+fn gather_columns<S: Simd>(simd: S, records: &[Line], lines: usize, rows: &[u32], columns: &mut [f32], stride: usize) {
+    for line in 0..lines {
+        let columns = &mut columns[line * LANES * stride..][..LANES * stride];
+        for (chunk, rows) in rows.chunks_exact(LANES).enumerate() {
+            let mut values = [Lanes::splat(simd, 0.0); LANES];
+            for (place, &row) in values.iter_mut().zip(rows) {
+                *place = Lanes::from_slice(simd, &records[row as usize * lines + line].0);
+            }
+            transpose(&mut values);
+            for (value, column) in values.iter().zip(columns.chunks_exact_mut(stride)) {
+                value.store_slice(&mut column[chunk * LANES..][..LANES]);
+            }
+        }
+    }
+}
