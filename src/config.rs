@@ -25,6 +25,10 @@ pub const MAX_MEMORY: u64 = (1 << 42) - 1024;
 pub const MAX_THREADS: usize = 1024;
 /// Most pixels of an image: the greatest width and height there are.
 pub const MAX_IMAGE_PIXELS: u64 = 1 << 40;
+/// Most disk: 1 EiB.
+pub const MAX_DISK: u64 = 1 << 60;
+/// Longest time that images are kept: ten years.
+pub const MAX_TTL: Duration = Duration::from_secs(10 * 365 * 86_400);
 /// Longest deadline: a day.
 pub const MAX_DEADLINE: Duration = Duration::from_secs(86_400);
 /// Most of whatever is counted one by one: connections, requests, images.
@@ -99,8 +103,11 @@ settings! {
     /// Listen beyond loopback without tokens: for networks that let nobody else in
     insecure_no_auth: bool = false, "", |_| true, "";
 
-    /// Folder for canvases and unread results; made if it is not there. By default $TMPDIR or /var/tmp
-    data_dir: PathBuf = std::env::var_os("TMPDIR").filter(|dir| !dir.is_empty()).unwrap_or_else(|| "/var/tmp".into()).into(),
+    /// Folder for images and unread results, of this service alone; made if it is not there. By default rpfd in $TMPDIR or
+    /// /var/tmp
+    data_dir: PathBuf = PathBuf::from(
+        std::env::var_os("TMPDIR").filter(|dir| !dir.is_empty()).unwrap_or_else(|| "/var/tmp".into())
+    ).join("rpfd"),
         "DIR", |dir| !dir.as_os_str().is_empty(), "must name a folder";
 
     /// Memory for tiles at work (samples, the filter's buffers, results) and, a share of it (a quarter up to 64 MiB, then
@@ -133,6 +140,14 @@ settings! {
 
     /// Images open at once. 1 to 65536
     images: usize = 1024, "N", count, "must be 1 to 65536";
+
+    /// Disk for all images; what one takes at worst is set aside when it is opened. 1MiB to 1EiB
+    disk: ByteSize = ByteSize(64 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_DISK).contains(&size.0),
+        "must be 1MiB to 1EiB";
+
+    /// How long an image is kept that nobody uses. A second to ten years
+    image_ttl: Duration = Duration::from_secs(7 * 86_400), "TIME",
+        |time| (Duration::from_secs(1)..=MAX_TTL).contains(time), "must be a second to ten years";
 
     /// Pixels of an image, at most; its canvas takes 12 bytes of disk for each. 1 to 2^40
     image_pixels: u64 = 1 << 30, "N", |n| (1..=MAX_IMAGE_PIXELS).contains(n), "must be 1 to 2^40";
@@ -234,6 +249,8 @@ mod tests {
             requests: 0,
             token_requests: 0,
             images: 0,
+            disk: ByteSize(0),
+            image_ttl: Duration::ZERO,
             image_pixels: 0,
             log: "a=b=c".to_owned(),
             metrics_listen: None,
@@ -264,6 +281,9 @@ mod tests {
         assert!(with(&|c| c.streams = 1000) && !with(&|c| c.streams = 1001));
         assert!(with(&|c| c.disk_reserve.0 = 4096) && !with(&|c| c.disk_reserve.0 = 4095));
         assert!(with(&|c| c.image_pixels = MAX_IMAGE_PIXELS) && !with(&|c| c.image_pixels = MAX_IMAGE_PIXELS + 1));
+        assert!(with(&|c| c.disk.0 = MAX_DISK) && !with(&|c| c.disk.0 = MAX_DISK + 1));
+        assert!(with(&|c| c.image_ttl = second) && !with(&|c| c.image_ttl = second / 2));
+        assert!(with(&|c| c.image_ttl = MAX_TTL) && !with(&|c| c.image_ttl = MAX_TTL + second));
         assert!(with(&|c| c.queue = MAX_COUNT) && !with(&|c| c.queue = MAX_COUNT + 1));
         assert!(with(&|c| c.work_deadline = MAX_DEADLINE) && !with(&|c| c.work_deadline = MAX_DEADLINE + second));
         assert!(with(&|c| c.min_rate.0 = 1 << 30) && !with(&|c| c.min_rate.0 = (1 << 30) + 1));

@@ -11,7 +11,9 @@
 //! - `stitch`: the image being assembled from filtered tiles, and OpenEXR files.
 //! - `picture`: PNG pictures of linear images, alone and side by side.
 //! - `report`: how far an image is from its reference, and what that took; stiff and extreme cases.
-//! - `store`: samples on disk, from which tiles of any size are cut.
+//! - `disk`: files that must survive a power loss.
+//! - `store`: samples on disk, from which tiles of any size are cut; records of what is stored.
+//! - `image`: an image that is being assembled, and kept safe: stitched pixels, samples, records.
 //! - `wire`: tiles and results as MessagePack, without I/O, and files of tiles.
 //! - `client`: HTTP client of the service, with retries.
 //! - `cli`: the `rpfd` command, one file per subcommand.
@@ -25,7 +27,11 @@ pub mod cli;
 pub mod client;
 #[cfg(feature = "program")]
 pub mod config;
+#[cfg(feature = "program")]
+pub mod disk;
 pub mod filter;
+#[cfg(feature = "program")]
+pub mod image;
 #[cfg(feature = "program")]
 pub mod picture;
 #[cfg(feature = "program")]

@@ -2,6 +2,7 @@
 #![expect(clippy::unwrap_used, reason = "a failed unwrap fails the test, in helpers too")]
 
 mod cli;
+mod fault;
 mod load;
 mod quality;
 mod service;

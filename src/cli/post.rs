@@ -11,7 +11,8 @@ use super::{
 };
 use crate::{
     client::{Client, ClientError, State},
-    filter::{SampleTile, Stopped, TileGeometry},
+    filter::{Halo, SampleTile, Stopped, TileGeometry, geometry::tiling},
+    image::description::channels_to_json,
     service::auth::check_token,
     stitch::atomic::AtomicFile,
     store::spool::Spool,
@@ -35,7 +36,7 @@ const IN_MEMORY: u64 = 256 << 20;
 
 /// Have a service denoise a file of tiles, and fetch the EXR
 ///
-/// Cuts tiles with the halo that the preset reads, sends them, and fetches the stitched image. What fails on the way is
+/// Cuts tiles with the halo that the preset reads, or bare ones with --halo neighbors, sends them, and fetches the stitched image. What fails on the way is
 /// sent again. With --id, a run that was cut off can be run again: tiles that the service has are not filtered twice.
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
@@ -52,6 +53,10 @@ pub(crate) struct Args {
     /// File with the token that the service wants to see; by default the one in the environment variable RPFD_TOKEN
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
+    /// Who brings the context around tiles: client, this command with every tile; neighbors, the tiles around it, so that
+    /// every sample is sent once
+    #[arg(long, value_name = "WHO", default_value = "client", value_parser = ["client", "neighbors"])]
+    halo: String,
     /// Width and height of the cores that are sent
     #[arg(long, value_name = "PIXELS", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
     tile: u32,
@@ -79,6 +84,7 @@ pub(crate) struct Args {
 const EXAMPLES: &str = "\
 Examples:
   rpfd post render.tiles.zst --to http://localhost:8080 -o render.exr
+  rpfd post render.tiles --to http://localhost:8080 -o render.exr --halo neighbors --tile 128
   rpfd post render.tiles --to https://farm.example -o render.exr --preset paper-fast --id shot-12-frame-7";
 
 impl Args {
@@ -115,12 +121,20 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         Spool::in_memory(bytes)
     };
     input.fill(&mut spool, &stop)?;
-    let tiles: Vec<TileGeometry> = cut_tiles(&input, &method, args.tile).collect();
+    let mut opening = args.method.to_json(&method);
+    let neighbors = args.halo == "neighbors";
+    let tiles: Vec<TileGeometry> = if neighbors {
+        announce(&input, &mut opening);
+        let cores = tiling(input.image(), args.tile);
+        cores.filter_map(|core| TileGeometry::new(input.image(), core, Halo::default()).ok()).collect()
+    } else {
+        cut_tiles(&input, &method, args.tile).collect()
+    };
     let id = args.id.clone().unwrap_or_else(new_id);
-    client.open_image(&id, input.image(), args.method.to_json(&method))?;
+    client.open_image(&id, input.image(), opening)?;
     let sending = Sending { client: &client, id: &id, connections: args.connections, stop: &stop };
     let fetched = sending.send(&input, &spool, &tiles).and_then(|sent| {
-        sending.fetch(sent.stored > 0, &args.exr.query(), &args.output)?;
+        sending.fetch(neighbors || sent.stored > 0, &args.exr.query(), &args.output)?;
         Ok(sent)
     });
     let Sent { tiles, repeated, bytes, .. } = fetched.inspect_err(|_| {
@@ -144,6 +158,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         say!("{output}: {tiles} tiles sent ({bytes}), {repeated} of them were there already, {seconds:.1} s");
     }
     Ok(())
+}
+
+/// Says of an image's tiles what the service must know before they come as bare cores.
+fn announce(input: &Input, opening: &mut serde_json::Value) {
+    let summary = &input.summary;
+    let even = !summary.varying && summary.tiles.iter().all(|tile| tile.max_per_pixel == summary.max_per_pixel);
+    opening["halo"] = "neighbors".into();
+    opening[if even { "samples" } else { "max_samples" }] = summary.max_per_pixel.into();
+    opening["channels"] = channels_to_json(summary.first.channels());
 }
 
 /// An id that nobody has.

@@ -114,15 +114,21 @@ pub(crate) fn sum<S: Simd>(lanes: Lanes<S>) -> f32 {
     (last[0] + last[2]) + (last[1] + last[3])
 }
 
+/// Lanes of half a vector: what is transposed at a time, since AVX2 has registers for no more.
+pub(crate) const HALF: usize = LANES / 2;
+
+/// Half a vector.
+pub(crate) type Half<S> = fearless_simd::f32x8<S>;
+
 /// Rows become columns: lane `i` of vector `j` becomes lane `j` of vector `i`.
 #[inline(always)]
-pub(crate) fn transpose<S: Simd>(vectors: &mut [Lanes<S>; LANES]) {
+pub(crate) fn transpose<S: Simd>(vectors: &mut [Half<S>; HALF]) {
     // A perfect shuffle moves the highest bit of the vector's number to the lowest of the lane's, and the highest of the
-    // lane's to the lowest of the vector's; four of them exchange the two.
-    for _ in 0..LANES.ilog2() {
+    // lane's to the lowest of the vector's; three of them exchange the two.
+    for _ in 0..HALF.ilog2() {
         let old = *vectors;
-        for i in 0..LANES / 2 {
-            (vectors[2 * i], vectors[2 * i + 1]) = old[i].interleave(old[i + LANES / 2]);
+        for i in 0..HALF / 2 {
+            (vectors[2 * i], vectors[2 * i + 1]) = old[i].interleave(old[i + HALF / 2]);
         }
     }
 }

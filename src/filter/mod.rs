@@ -170,6 +170,9 @@ pub enum LeftOutReason {
 }
 
 impl LeftOutReason {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Constant, Self::Missing, Self::Unused, Self::Equal];
+
     /// A stable word for reports: `constant`, `missing`, `unused`, `equal`.
     pub const fn as_str(self) -> &'static str {
         match self {

@@ -1,16 +1,19 @@
 //! Images that are being assembled: `/v1/images` and what is below it, but for the tiles that come in.
 
 use std::{
-    collections::{BTreeMap, HashMap},
-    hash::{BuildHasher, RandomState},
+    collections::BTreeMap,
+    fs::File,
     io::{self, Write},
-    sync::{Arc, Mutex, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard},
+    sync::{
+        Arc, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
 };
 
 use axum::{
     Json,
-    extract::{FromRequestParts, Path as UrlPath, Request, State},
-    http::{StatusCode, header, request::Parts},
+    extract::{Request, State},
+    http::{StatusCode, header},
     response::{IntoResponse, Response},
 };
 use serde_json::{Value, json};
@@ -22,13 +25,16 @@ use super::{
     picture::{encode_png, write_file},
     problem::{Refusal, corners},
     query::{Form, NoQuery, Parameters, attributes},
+    regions,
+    registry::{Id, Opened, no_image},
     results::file_response,
-    work::blocking,
+    work::{Stop, blocking},
 };
 use crate::{
-    config::Config,
-    filter::{ChannelSet, Filtered, Method, Rect, SampleTile},
-    stitch::{Added, Claim, Offer, StitchError, Stitcher, digest::digest},
+    admission::AdmissionError,
+    filter::{Rect, TileGeometry, geometry::Halo, samples::MAX_SAMPLES_PER_PIXEL},
+    image::{Announced, Description, Image, RegionState, description::channels_from_json, disk_bytes},
+    stitch::{CanvasError, ExrOptions, Pixels, StitchError, Stitcher, StoredPixels, exr},
     wire::{
         Problem, TileReport,
         message::{ReplacedCounts, WorkCounts},
@@ -37,178 +43,66 @@ use crate::{
 
 /// Most bytes of the JSON that opens an image.
 const MAX_JSON: usize = 64 << 10;
-/// Most bytes of an id.
-const MAX_ID: usize = 128;
 /// Most missing regions that a problem lists; it says how many there are.
 const MAX_LISTED: usize = 1000;
-/// Tiles of an image at most: each is kept track of in memory, a few hundred bytes.
-const MAX_TILES: usize = 1 << 17;
-
-/// The id of an image, from the path of a request.
-#[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub(super) struct Id(String);
-
-impl<S: Send + Sync> FromRequestParts<S> for Id {
-    type Rejection = Refusal;
-
-    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Refusal> {
-        // What is not even text is no image's id.
-        let id = UrlPath::<String>::from_request_parts(parts, state).await;
-        id.map(|UrlPath(id)| Self(id)).map_err(|error| no_image(&error.body_text()))
-    }
-}
-
-impl Id {
-    /// An id that a client has chosen.
-    fn chosen(id: String) -> Result<Self, Refusal> {
-        let fine = |b: u8| b.is_ascii_alphanumeric() || b"._-".contains(&b);
-        if (1..=MAX_ID).contains(&id.len()) && id.bytes().all(fine) && !id.starts_with('.') {
-            return Ok(Self(id));
-        }
-        let right = "must be 1 to 128 of A-Z a-z 0-9 . _ - and not start with a dot";
-        Err(open_refused(format!("id = {id:?}: {right}")))
-    }
-
-    /// An id that nobody has.
-    fn new() -> Self {
-        let random = || RandomState::new().hash_one("image");
-        Self(format!("{:016x}{:016x}", random(), random()))
-    }
-}
+/// Of what a region waits for, this much is listed.
+const MAX_WAITED: usize = 16;
 
 fn open_refused(detail: String) -> Refusal {
     Refusal::new(StatusCode::BAD_REQUEST, "bad_parameter", "The image cannot be opened", detail)
 }
 
-fn no_image(id: &str) -> Refusal {
-    let detail = format!("there is no image {id:?}: it was never opened, or is forgotten");
-    Refusal::new(StatusCode::NOT_FOUND, "unknown_image", "There is no such image", detail)
+/// What can be said of an image in few words; when it expires its owner knows.
+pub(super) fn summary(id: &Id, image: &Image) -> Value {
+    let (description, inner) = (image.description(), image.read());
+    let stitcher = inner.stitcher();
+    let mut summary = json!({
+        "id": id.0,
+        "width": description.size[0],
+        "height": description.size[1],
+        "preset": description.method.preset_name(),
+        "seed": description.seed,
+        "parameters": description.method.parameters().into_iter().collect::<BTreeMap<_, _>>(),
+        "halo": if description.neighbors.is_some() { "neighbors" } else { "client" },
+        "complete": stitcher.is_complete(),
+        "finished": inner.finished(),
+        "tiles_done": stitcher.tiles().count(),
+        "pixels": stitcher.image().area(),
+        "pixels_done": stitcher.pixels_done(),
+        "disk": description.disk,
+    });
+    if let Some(regions) = inner.regions() {
+        let (tiles, pixels) = inner.arrived();
+        summary["tiles_stored"] = tiles.into();
+        summary["pixels_stored"] = pixels.into();
+        summary["regions"] = regions.count().into();
+        summary["regions_open"] = regions.open().into();
+    }
+    summary
 }
 
-/// What becomes of a tile that was offered.
-pub(super) enum Outcome {
-    /// It is stored already, made from the same samples.
-    Repeated,
-    /// It is to be filtered.
-    Filter(Claim),
-}
-
-/// An image that is being assembled.
-pub(super) struct Image {
-    id: Id,
-    size: [u32; 2],
-    pub(super) method: Arc<Method>,
-    pub(super) seed: u64,
-    /// Whether what can have no effect is left out; the same image either way.
-    pub(super) leave_out: bool,
-    /// The channels of its tiles: those of the first that came whole.
-    channels: OnceLock<ChannelSet>,
-    canvas: RwLock<Canvas>,
-}
-
-struct Canvas {
-    stitcher: Stitcher,
-    /// Time that filtering took, by core.
-    seconds: HashMap<Rect, f64>,
-}
-
-impl Image {
-    fn read(&self) -> RwLockReadGuard<'_, Canvas> {
-        self.canvas.read().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn write(&self) -> RwLockWriteGuard<'_, Canvas> {
-        self.canvas.write().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Whether it was opened in the same way.
-    fn same(&self, other: &Self) -> bool {
-        self.size == other.size && self.method == other.method && self.seed == other.seed
-    }
-
-    /// Refuses tiles of other images.
-    pub(super) fn check(&self, image: Rect, channels: &ChannelSet) -> Result<(), Refusal> {
-        let refuse = |code, detail| {
-            let title = "The tile is not of this image";
-            Err(Refusal::new(StatusCode::UNPROCESSABLE_ENTITY, code, title, detail))
-        };
-        let ([width, height], Rect { width: w, height: h, .. }) = (self.size, image);
-        if [w, h] != self.size {
-            let detail = format!("the tile is of an image of {w} x {h} pixels, this one has {width} x {height}");
-            return refuse("image_mismatch", detail);
-        }
-        match self.channels.get() {
-            Some(known) if known != channels => {
-                let names =
-                    |set: &ChannelSet| set.channels().iter().map(|c| c.name.clone()).collect::<Vec<_>>().join(", ");
-                let detail = format!(
-                    "the tile's channels ({}) are not those of the tiles before ({}): names, order, roles and components \
-                     must be the same in all tiles of an image",
-                    names(channels),
-                    names(known)
-                );
-                refuse("channel_mismatch", detail)
-            }
-            _ => Ok(()),
-        }
-    }
-
-    /// Asks whether a tile is wanted. Blocks.
-    pub(super) fn offer(&self, tile: &SampleTile, replace: bool) -> Result<Outcome, Refusal> {
-        self.channels.get_or_init(|| tile.channels().clone());
-        self.check(tile.geometry().image(), tile.channels())?;
-        let digest = digest(tile);
-        let mut canvas = self.write();
-        if canvas.stitcher.known() >= MAX_TILES {
-            let detail = format!("an image has {MAX_TILES} tiles at most: send larger ones");
-            let title = "The image has too many tiles";
-            return Err(Refusal::new(StatusCode::UNPROCESSABLE_ENTITY, "too_many_tiles", title, detail));
-        }
-        match canvas.stitcher.offer(tile.geometry().core(), digest, replace)? {
-            Offer::Repeated => Ok(Outcome::Repeated),
-            Offer::Filter(claim) => Ok(Outcome::Filter(claim)),
-        }
-    }
-
-    /// Puts a filtered core on the canvas and says what became of it. Blocks.
-    pub(super) fn add(&self, claim: Claim, filtered: &Filtered, seconds: f64) -> Result<&'static str, Refusal> {
-        let mut canvas = self.write();
-        match canvas.stitcher.add(claim, filtered)? {
-            Added::Repeated => Ok("repeated"),
-            Added::Stored => {
-                canvas.seconds.insert(filtered.core, seconds);
-                Ok("filtered")
-            }
-        }
-    }
-
-    fn summary(&self) -> Value {
-        let canvas = self.read();
-        let stitcher = &canvas.stitcher;
-        json!({
-            "id": self.id.0,
-            "width": self.size[0],
-            "height": self.size[1],
-            "preset": self.method.preset_name(),
-            "seed": self.seed,
-            "parameters": self.method.parameters().into_iter().collect::<BTreeMap<_, _>>(),
-            "complete": stitcher.is_complete(),
-            "tiles_done": stitcher.tiles().count(),
-            "pixels": stitcher.image().area(),
-            "pixels_done": stitcher.pixels_done(),
-        })
+impl Opened {
+    fn summary(&self, service: &Shared) -> Value {
+        let mut summary = summary(&self.entry.id, &self.image);
+        summary["expires"] = service.images.expires(&self.entry).into();
+        summary
     }
 
     /// Writes all that there is to say, the tiles one by one: there may be many.
-    fn write_status(&self, out: &mut impl Write) -> io::Result<()> {
-        let mut status = self.summary();
-        let canvas = self.read();
-        let stitcher = &canvas.stitcher;
+    fn write_status(&self, service: &Shared, out: &mut impl Write) -> io::Result<()> {
+        let mut status = self.summary(service);
+        let (description, inner) = (self.image.description(), self.image.read());
+        let stitcher = inner.stitcher();
         status["missing"] = stitcher.missing().into_iter().map(|rect| json!(corners(rect))).collect();
         let totals = stitcher.totals();
-        let (replaced, needed) = (totals.replaced, totals.halo_needed);
+        let (mut replaced, needed) = (totals.replaced, totals.halo_needed);
+        if inner.regions().is_some() {
+            // What regions are cut from was finite already.
+            replaced = inner.replaced();
+        }
+        let tiles = || stitcher.tiles().map(|(core, report)| (core, report, inner.seconds(&core)));
         status["totals"] = json!({
-            "seconds": canvas.seconds.values().sum::<f64>(),
+            "seconds": tiles().map(|(_, _, seconds)| seconds).sum::<f64>(),
             "tiles": totals.tiles,
             "pixels": totals.pixels,
             "samples": totals.samples,
@@ -234,13 +128,16 @@ impl Image {
         status["totals"]["left_out"] = left_out
             .map(|((plane, reason), tiles)| json!({ "plane": plane, "reason": reason, "tiles": tiles }))
             .collect();
+        if inner.regions().is_some() {
+            let trouble = self.entry.runner.trouble.lock().unwrap_or_else(PoisonError::into_inner);
+            status["trouble"] = json!(*trouble);
+        }
         // The object, but for its last brace.
         let mut head = status.to_string();
         head.pop();
         write!(out, "{head},\"tiles\":[")?;
-        for (i, (core, report)) in stitcher.tiles().enumerate() {
-            let seconds = canvas.seconds.get(&core).copied().unwrap_or(0.0);
-            let mut report = json!(TileReport::new(report, &self.method, self.seed, seconds));
+        for (i, (core, report, seconds)) in tiles().enumerate() {
+            let mut report = json!(TileReport::new(report, &description.method, description.seed, seconds));
             // The same for all tiles, or told of all of them together, above.
             if let Value::Object(report) = &mut report {
                 report.retain(|name, _| !["preset", "seed", "parameters", "left_out"].contains(&name.as_str()));
@@ -248,95 +145,169 @@ impl Image {
             let comma = if i == 0 { "" } else { "," };
             write!(out, "{comma}{}", json!({ "tile": corners(core), "report": report }))?;
         }
-        write!(out, "]}}")
-    }
-
-    /// Refuses while pixels are missing, and says which.
-    fn check_complete(&self, stitcher: &Stitcher, partial: bool) -> Result<(), Refusal> {
-        let Err(error) = stitcher.check_complete(partial) else { return Ok(()) };
-        let regions = matches!(error, StitchError::Incomplete { .. }).then(|| stitcher.missing());
-        let mut problem = Problem::from(error);
-        if let Some(missing) = regions {
-            let listed: Value = missing.iter().take(MAX_LISTED).map(|rect| json!(corners(*rect))).collect();
-            problem = problem.with("missing", listed).with("missing_regions", missing.len());
-            problem.detail += "; ?partial=true gives what there is";
-        }
-        Err(problem.into())
-    }
-}
-
-/// All images, by id.
-pub(super) struct Images {
-    all: Mutex<BTreeMap<Id, Arc<Image>>>,
-    limit: usize,
-}
-
-impl Images {
-    /// None yet, and at most so many.
-    pub(super) const fn new(limit: usize) -> Self {
-        Self { all: Mutex::new(BTreeMap::new()), limit }
-    }
-
-    fn with<T>(&self, work: impl FnOnce(&mut BTreeMap<Id, Arc<Image>>) -> T) -> T {
-        work(&mut self.all.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-
-    /// How many there are.
-    pub(super) fn count(&self) -> usize {
-        self.with(|all| all.len())
-    }
-
-    pub(super) fn find(&self, id: &Id) -> Result<Arc<Image>, Refusal> {
-        self.with(|all| all.get(id).cloned()).ok_or_else(|| no_image(&id.0))
-    }
-
-    /// Adds an image, unless there is one with its id: says whether it is new, and gives the one that is there now.
-    fn open(&self, image: Image) -> Result<(bool, Arc<Image>), Refusal> {
-        self.with(|all| match all.get(&image.id) {
-            Some(known) if known.same(&image) => Ok((false, Arc::clone(known))),
-            Some(_) => Err(Refusal::new(
-                StatusCode::CONFLICT,
-                "image_conflict",
-                "The image is there, opened differently",
-                format!("image {:?} was opened with another size, preset, seed or parameters", image.id.0),
-            )),
-            None if all.len() >= self.limit => Err(Problem::new(
-                503,
-                "too_many_images",
-                "Too many images are open",
-                format!("{} images are open; delete some that are done", self.limit),
-            )
-            .with("retry_after", 60)
-            .into()),
-            None => {
-                let image = Arc::new(image);
-                all.insert(image.id.clone(), Arc::clone(&image));
-                Ok((true, image))
+        write!(out, "]")?;
+        if let Some(regions) = inner.regions() {
+            write!(out, ",\"waiting\":[")?;
+            let open = (0..regions.count()).filter(|&index| regions.state(index) != RegionState::Done);
+            for (i, index) in open.enumerate() {
+                let state = match regions.state(index) {
+                    RegionState::Waiting => "waiting",
+                    RegionState::Ready | RegionState::Done => "ready",
+                    RegionState::Running => "running",
+                };
+                let mut region = json!({ "region": corners(regions.core(index)), "state": state });
+                if state == "waiting" {
+                    let absent = inner.absent(&regions.window(index));
+                    region["for"] = absent.iter().take(MAX_WAITED).map(|rect| json!(corners(*rect))).collect();
+                    region["for_regions"] = absent.len().into();
+                }
+                let comma = if i == 0 { "" } else { "," };
+                write!(out, "{comma}{region}")?;
             }
+            write!(out, "]")?;
+        }
+        write!(out, "}}")
+    }
+
+    /// Writes what there is of the image, without keeping anybody from adding to it: if a tile is replaced meanwhile it
+    /// is written again.
+    fn consistent<T>(
+        &self,
+        partial: bool,
+        stop: &AtomicBool,
+        write: impl Fn(&Snapshot, bool, u64) -> Result<Option<T>, Refusal>,
+    ) -> Result<T, Refusal> {
+        loop {
+            let (snapshot, settled, replacements) = {
+                let inner = self.image.read();
+                let settled = inner.settled();
+                check_complete(inner.stitcher(), partial || settled && inner.finished())?;
+                let (pixels, missing) = (inner.stitcher().pixels(), inner.stitcher().check_complete(true)?);
+                (Snapshot { pixels, missing, stop }, settled, inner.replacements())
+            };
+            if let Some(written) = write(&snapshot, settled, replacements)?
+                && self.image.read().replacements() == replacements
+            {
+                return Ok(written);
+            }
+        }
+    }
+
+    /// The image as an EXR file.
+    fn exr(&self, service: &Shared, options: &ExrOptions, partial: bool, stop: &AtomicBool) -> Result<File, Refusal> {
+        self.image.flush()?;
+        self.consistent(partial, stop, |snapshot, settled, replacements| {
+            if settled && let Some(file) = self.image.result(options) {
+                return Ok(Some(file));
+            }
+            self.image.verify(stop)?;
+            let mut full = options.clone();
+            if snapshot.missing > 0 {
+                full.attributes.insert("rpfd:missing".into(), snapshot.missing.to_string());
+            }
+            if !settled {
+                let file = write_file(&service.config.data_dir, |out| Ok(exr::encode(snapshot, &full, out).map(drop)?));
+                return Ok(Some(file?));
+            }
+            // It will not change any more: worth keeping.
+            let file = tempfile::NamedTempFile::new_in(self.image.folder())?;
+            let mut out = io::BufWriter::with_capacity(256 << 10, file);
+            exr::encode(snapshot, &full, &mut out)?;
+            let file = out.into_inner().map_err(io::IntoInnerError::into_error)?;
+            let reader = file.reopen()?;
+            Ok(self.image.keep_result(file, options, replacements).then_some(reader))
         })
     }
 }
 
+/// The pixels of an image at a moment, as long as somebody waits for them.
+struct Snapshot<'a> {
+    pixels: StoredPixels,
+    /// Pixels that are missing.
+    missing: u64,
+    stop: &'a AtomicBool,
+}
+
+impl Pixels for Snapshot<'_> {
+    fn image(&self) -> Rect {
+        self.pixels.image()
+    }
+
+    fn read(&self, rect: Rect, pixels: &mut [[f32; 3]]) -> Result<(), CanvasError> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Err(CanvasError::Stopped);
+        }
+        self.pixels.read(rect, pixels)
+    }
+}
+
+/// Refuses while pixels are missing, and says which.
+fn check_complete(stitcher: &Stitcher, partial: bool) -> Result<(), Refusal> {
+    let Err(error) = stitcher.check_complete(partial) else { return Ok(()) };
+    let regions = matches!(error, StitchError::Incomplete { .. }).then(|| stitcher.missing());
+    let mut problem = Problem::from(error);
+    if let Some(missing) = regions {
+        let listed: Value = missing.iter().take(MAX_LISTED).map(|rect| json!(corners(*rect))).collect();
+        problem = problem.with("missing", listed).with("missing_regions", missing.len());
+        problem.detail += "; ?partial=true gives what there is";
+    }
+    Err(problem.into())
+}
+
 /// What the JSON that opens an image says.
-fn described(body: &[u8], config: &Config) -> Result<Image, Refusal> {
+fn described(body: &[u8], service: &Shared) -> Result<(Id, Description), Refusal> {
+    let config = &service.config;
     let mut parameters = Parameters::of_json(body)?;
     let mut side = |name: &str| {
         let side = parameters.number(name)?;
         side.ok_or_else(|| open_refused(format!("{name:?} is missing: an image needs width and height, in pixels")))
     };
     let size: [u32; 2] = [side("width")?, side("height")?];
-    let id = parameters.take("id").map_or_else(|| Ok(Id::new()), Id::chosen)?;
+    let id = match parameters.take("id") {
+        None => Id::new(),
+        Some(id) => Id::chosen(&id).ok_or_else(|| {
+            let right = "must be 1 to 128 of A-Z a-z 0-9 . _ - and not start with a dot";
+            open_refused(format!("id = {id:?}: {right}"))
+        })?,
+    };
     let leave_out = parameters.leave_out()?;
+    let announced = if parameters.neighbors()? { Some(announced(&mut parameters)?) } else { None };
     let (method, seed) = parameters.method()?;
+    TileGeometry::new(size, Rect::new(0, 0, 1, 1), Halo::default()).map_err(StitchError::from)?;
     let (pixels, most) = (u64::from(size[0]) * u64::from(size[1]), config.image_pixels);
     if pixels > most {
         let detail =
             format!("{} x {} is {pixels} pixels: this service takes images of {most} at most", size[0], size[1]);
         return Err(Refusal::new(StatusCode::PAYLOAD_TOO_LARGE, "image_too_large", "The image is too large", detail));
     }
-    let stitcher = Stitcher::new(size[0], size[1], &config.data_dir)?;
-    let canvas = RwLock::new(Canvas { stitcher, seconds: HashMap::new() });
-    Ok(Image { id, size, method: Arc::new(method), seed, leave_out, channels: OnceLock::new(), canvas })
+    let mut description = Description { size, method, seed, leave_out, neighbors: announced, disk: 0 };
+    if let Some(announced) = &mut description.neighbors {
+        // A quarter, so that a few regions are at work while tiles come in.
+        let (threads, most) = (config.threads, service.budget.total());
+        let chosen = announced.choose_region(size, &description.method, threads, most / 4, most);
+        chosen.map_err(|needed| AdmissionError::TooLarge { needed, total: most })?;
+    }
+    description.disk = disk_bytes(&description);
+    Ok((id, description))
+}
+
+/// What is said of tiles that will come as bare cores.
+fn announced(parameters: &mut Parameters) -> Result<Announced, Refusal> {
+    let (samples, most) = (parameters.number::<u32>("samples")?, parameters.number::<u32>("max_samples")?);
+    let (samples, varying) = match (samples, most) {
+        (Some(n), None) => (n, false),
+        (None, Some(n)) => (n, true),
+        _ => {
+            let right = "\"samples\", of each pixel, or \"max_samples\", if they vary: one of them must be there";
+            return Err(open_refused(format!("with \"halo\": \"neighbors\" {right}")));
+        }
+    };
+    if !(1..=MAX_SAMPLES_PER_PIXEL).contains(&samples) {
+        return Err(open_refused(format!("{samples} samples: must be 1 to {MAX_SAMPLES_PER_PIXEL}")));
+    }
+    let channels = parameters.channels().unwrap_or_default();
+    let channels = channels_from_json(&channels).map_err(|why| open_refused(format!("\"channels\": {why}")))?;
+    Ok(Announced { channels, samples, varying, region: 0 })
 }
 
 /// `POST /v1/images`.
@@ -344,67 +315,92 @@ pub(super) async fn open(State(service): State<Shared>, charge: Charge, request:
     Parameters::of_query(request.uri())?.done("none: an image is described in the body")?;
     let (parts, body) = request.into_parts();
     let body = Frames::new(&parts.headers, body, charge, service.pace())?.all(MAX_JSON).await?;
-    let (status, image) = blocking(move || {
-        let image = described(&body, &service.config)?;
-        let (new, image) = service.images.open(image)?;
+    let (status, id, summary) = blocking(move || {
+        let (id, description) = described(&body, &service)?;
+        let (new, opened) = service.images.open(id, description)?;
         let status = if new { StatusCode::CREATED } else { StatusCode::OK };
-        Ok::<_, Refusal>((status, image))
+        Ok::<_, Refusal>((status, opened.entry.id.clone(), opened.summary(&service)))
     })
     .await??;
-    tracing::info!(id = image.id.0, width = image.size[0], height = image.size[1], "image opened");
-    let location = format!("/v1/images/{}", image.id.0);
-    let summary = blocking(move || image.summary()).await?;
+    tracing::info!(id = id.0, width = %summary["width"], height = %summary["height"], "image opened");
+    let location = format!("/v1/images/{}", id.0);
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
 }
 
 /// `GET /v1/images`.
 pub(super) async fn list(State(service): State<Shared>, _: NoQuery) -> Result<Json<Value>, Refusal> {
-    let images: Vec<_> = service.images.with(|all| all.values().cloned().collect());
-    let list = blocking(move || images.iter().map(|image| image.summary()).collect::<Value>()).await?;
+    let list = blocking(move || service.images.list()).await?;
     Ok(Json(json!({ "images": list })))
 }
 
 /// `GET /v1/images/{id}`.
 pub(super) async fn status(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<Response, Refusal> {
-    let image = service.images.find(&id)?;
-    let file = blocking(move || write_file(&service.config.data_dir, |out| Ok(image.write_status(out)?)));
+    let file = blocking(move || {
+        let opened = service.images.find(&id)?;
+        opened.image.flush()?;
+        write_file(&service.config.data_dir, |out| Ok(opened.write_status(&service, out)?))
+    });
     Ok(file_response(file.await??, "application/json").await?)
 }
 
 /// `DELETE /v1/images/{id}`.
 pub(super) async fn delete(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<StatusCode, Refusal> {
-    let removed = service.images.with(|all| all.remove(&id)).ok_or_else(|| no_image(&id.0))?;
+    let name = id.clone();
+    let removed = blocking(move || service.images.delete(&name)).await??;
+    if !removed {
+        return Err(no_image(&id.0));
+    }
     tracing::info!(id = id.0, "image deleted");
-    // Closing the last handle of a large file takes a while.
-    blocking(move || drop(removed)).await?;
     Ok(StatusCode::NO_CONTENT)
+}
+
+/// `POST /v1/images/{id}/finish`.
+pub(super) async fn finish(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<Response, Refusal> {
+    let (settled, summary) = blocking(move || {
+        let opened = service.images.find(&id)?;
+        opened.image.finish()?;
+        regions::kick(&service, &opened);
+        let settled = opened.image.read().settled();
+        Ok::<_, Refusal>((settled, opened.summary(&service)))
+    })
+    .await??;
+    tracing::info!(id = %summary["id"], "image finished");
+    let status = if settled { StatusCode::OK } else { StatusCode::ACCEPTED };
+    Ok((status, Json(summary)).into_response())
 }
 
 /// `GET /v1/images/{id}/result.exr`.
 pub(super) async fn result(State(service): State<Shared>, id: Id, request: Request) -> Result<Response, Refusal> {
-    let image = service.images.find(&id)?;
+    let images = Arc::clone(&service);
+    let opened = blocking(move || images.images.find(&id)).await??;
     let mut parameters = Parameters::of_query(request.uri())?;
     let partial = parameters.flag("partial")?;
     let mut options = parameters.exr()?;
-    options.attributes = attributes(&image.method, image.seed);
-    let file = blocking(move || {
-        let stitcher = &image.read().stitcher;
-        image.check_complete(stitcher, partial)?;
-        write_file(&service.config.data_dir, |out| Ok(stitcher.encode_exr(&options, partial, out).map(drop)?))
-    });
-    Ok(file_response(file.await??, Form::Exr.media()).await?)
+    let description = opened.image.description();
+    options.attributes = attributes(&description.method, description.seed);
+    // What one has written the next need not write again.
+    let entry = Arc::clone(&opened.entry);
+    let _turn = entry.encoding.lock().await;
+    let stop = Stop::default();
+    let flag = stop.flag();
+    let file = blocking(move || opened.exr(&service, &options, partial, &flag)).await??;
+    Ok(file_response(file, Form::Exr.media()).await?)
 }
 
 /// `GET /v1/images/{id}/preview.png`.
 pub(super) async fn preview(State(service): State<Shared>, id: Id, request: Request) -> Result<Response, Refusal> {
-    let image = service.images.find(&id)?;
+    let images = Arc::clone(&service);
+    let opened = blocking(move || images.images.find(&id)).await??;
     let mut parameters = Parameters::of_query(request.uri())?;
     let partial = parameters.flag("partial")?;
     parameters.done("partial")?;
+    let stop = Stop::default();
+    let flag = stop.flag();
     let file = blocking(move || {
-        let stitcher = &image.read().stitcher;
-        image.check_complete(stitcher, partial)?;
-        write_file(&service.config.data_dir, |out| encode_png(&stitcher.pixels(), out))
+        opened.image.flush()?;
+        opened.consistent(partial, &flag, |snapshot, _, _| {
+            write_file(&service.config.data_dir, |out| encode_png(snapshot, out)).map(Some)
+        })
     });
     Ok(file_response(file.await??, Form::Png.media()).await?)
 }

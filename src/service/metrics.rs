@@ -212,7 +212,7 @@ impl Metrics {
         );
         own.register("ready", "Whether the service takes work: 1 or 0", all.ready.clone());
         // So that a rate is there from the first of its kind on.
-        for outcome in ["filtered", "repeated", "failed", "stopped"] {
+        for outcome in ["filtered", "stored", "repeated", "failed", "stopped"] {
             drop(all.tiles.get_or_create(&Outcome { outcome }));
         }
         for phase in [Phase::Queue, Phase::Receive, Phase::Filter, Phase::Write] {
@@ -243,7 +243,7 @@ impl Metrics {
         self.problems.get_or_create(&Code { code: code.to_owned() }).inc();
     }
 
-    /// A tile is done with: `filtered`, `repeated`, `failed` or `stopped`.
+    /// A tile is done with: `filtered`, `stored`, `repeated`, `failed` or `stopped`.
     pub(super) fn tile(&self, outcome: &'static str) {
         self.tiles.get_or_create(&Outcome { outcome }).inc();
     }

@@ -15,12 +15,15 @@ mod health;
 mod images;
 mod inflate;
 mod metrics;
+mod opened;
 mod openapi;
 mod pace;
 mod picture;
 mod problem;
 mod query;
 mod receive;
+mod regions;
+mod registry;
 mod results;
 mod routes;
 mod stream;
@@ -46,13 +49,15 @@ use crate::{
 use auth::{Auth, TokensError};
 use connection::Limits;
 use health::{Readiness, Reason};
-use images::Images;
 use metrics::{Counted, Metrics};
 use pace::Pace;
+use registry::{Images, StartError};
 use work::Work;
 
 /// Connections at once to the address for metrics.
 const METRICS_CONNECTIONS: usize = 16;
+/// How often images that nobody uses are looked for.
+const TIDY: Duration = Duration::from_secs(30);
 
 /// The service could not start or go on.
 #[derive(Debug, thiserror::Error)]
@@ -80,6 +85,12 @@ pub enum ServeError {
         /// Why not.
         source: io::Error,
     },
+    /// Another service uses the data folder.
+    #[error("the data folder {} is in use by another service", path.display())]
+    InUse {
+        /// The folder.
+        path: PathBuf,
+    },
     /// The threads cannot be started.
     #[error("cannot start the filter's threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
@@ -93,6 +104,7 @@ impl ServeError {
             Self::Tokens(_) => "bad_tokens",
             Self::Listen { .. } => "listen",
             Self::DataDir { .. } => "data_dir",
+            Self::InUse { .. } => "data_dir_in_use",
             Self::Threads(_) => "threads",
         }
     }
@@ -165,7 +177,10 @@ impl Service {
         let share = charge::share(config.memory.0);
         let [budget, requests, unread] =
             [config.memory.0 - share, share, config.unread_results.0].map(|bytes| Budget::new(bytes, config.queue));
-        let images = Images::new(config.images);
+        let images = Images::start(&config).map_err(|error| match error {
+            StartError::InUse => ServeError::InUse { path: config.data_dir.clone() },
+            StartError::Io(source) => data_dir(source),
+        })?;
         let (counts, readiness) = (Metrics::new(), Readiness::default());
         let inner = Inner { config, budget, requests, unread, work, images, auth, metrics: counts, readiness };
         Ok(Self { listener, address, metrics, inner: Arc::new(inner) })
@@ -205,6 +220,8 @@ impl Service {
                 accept(&listener, &router, &serving, &inner, METRICS_CONNECTIONS, &mut connections, never).await;
             });
         }
+        inner.images.resume(&inner);
+        let tidying = tokio::spawn(tidy(Arc::clone(&inner)));
         let router = routes::router(Arc::clone(&inner));
         let (config, simd) = (&inner.config, inner.config.simd.name());
         tracing::info!(%address, memory = %config.memory, threads = config.threads, simd, "listening");
@@ -217,7 +234,20 @@ impl Service {
         if timeout(inner.config.shutdown_deadline, all).await.is_err() {
             tracing::warn!(connections = connections.len(), "the deadline has passed; requests are cut off");
         }
+        // What is not filtered yet goes on at the next start.
+        tidying.abort();
+        inner.images.stop();
         Ok(())
+    }
+}
+
+/// Sees to images that nobody uses, now and then.
+async fn tidy(inner: Shared) {
+    let mut interval = tokio::time::interval(TIDY.min(inner.config.image_ttl / 4));
+    loop {
+        interval.tick().await;
+        let inner = Arc::clone(&inner);
+        let _ = work::blocking(move || inner.images.tidy()).await;
     }
 }
 

@@ -9,6 +9,7 @@ use axum::{
 use crate::{
     admission::AdmissionError,
     filter::{ParameterError, Rect, samples::SampleError},
+    image::ImageError,
     picture::PictureError,
     stitch::{ExrError, StitchError},
     wire::{Problem, WireError},
@@ -82,16 +83,23 @@ pub(super) fn internal(detail: impl std::fmt::Display) -> Problem {
 
 /// The disk or the file system refused.
 pub(super) fn storage(code: &str, detail: impl std::fmt::Display) -> Problem {
+    if code == "stopped" {
+        return Problem::new(503, "stopped", "The work was stopped", "the client has gone, or the image");
+    }
     tracing::error!(%detail, code, "storage error");
     match code {
         "disk-full" => Problem::new(507, "disk_full", "The service's disk is full", "the data folder takes no more"),
+        "damaged" => {
+            let advice = "delete the image, and send it anew";
+            Problem::new(500, "damaged", "A file of the image is damaged", format!("{detail}: {advice}"))
+        }
         _ => Problem::new(500, "storage", "The service's disk failed", "an I/O error; the service's log says more"),
     }
 }
 
 impl From<std::io::Error> for Refusal {
     fn from(error: std::io::Error) -> Self {
-        let full = crate::stitch::canvas::is_full(&error);
+        let full = crate::disk::is_full(&error);
         storage(if full { "disk-full" } else { "io" }, error).into()
     }
 }
@@ -157,6 +165,29 @@ impl From<StitchError> for Problem {
             StitchError::Canvas(inner) => storage(inner.code(), detail),
             StitchError::Exr(inner) => storage(inner.code(), detail),
             StitchError::Mismatch(_) => internal(detail),
+        }
+    }
+}
+
+impl From<ImageError> for Problem {
+    fn from(error: ImageError) -> Self {
+        let detail = error.to_string();
+        match error {
+            _ if error.is_damage() => storage("damaged", detail),
+            _ if error.is_full() => storage("disk-full", detail),
+            ImageError::Stitch(error) => error.into(),
+            ImageError::Finished => Self::new(409, "image_finished", "The image takes no more tiles", detail),
+            ImageError::TooManyTiles => Self::new(422, "too_many_tiles", "The image has too many tiles", detail),
+            ImageError::TooSmall(_) => Self::new(422, "tile_too_small", "The tile is too small", detail),
+            ImageError::SampleCount { .. } => {
+                Self::new(422, "samples_mismatch", "The tile's samples are not as announced", detail)
+            }
+            ImageError::TooLarge { needed, most, .. } => {
+                let title = "The tile needs more memory than the service has";
+                Self::new(413, "over_memory", title, detail).with("needed", needed).with("available", most)
+            }
+            ImageError::Stopped(_) => storage("stopped", detail),
+            _ => storage("io", detail),
         }
     }
 }

@@ -34,7 +34,7 @@ fn bad_parameter(name: &str, value: &str, right: &str) -> Refusal {
 
 /// The parameters of a request by name, taken out one by one; what is left at the end is unknown.
 #[derive(Debug)]
-pub(super) struct Parameters(BTreeMap<String, String>);
+pub(super) struct Parameters(BTreeMap<String, String>, Option<Value>);
 
 /// The pairs of a JSON object as they stand there.
 struct Object(Vec<(String, Value)>);
@@ -95,23 +95,34 @@ impl Parameters {
         for (name, value) in pairs.0 {
             add(&mut all, name, value)?;
         }
-        Ok(Self(all))
+        Ok(Self(all, None))
     }
 
-    /// Of a JSON object: numbers, texts, bools, and lists of these. A name may occur once.
+    /// Of a JSON object: numbers, texts, bools, and lists of these. A name may occur once. Its `channels` may be anything.
     pub(super) fn of_json(body: &[u8]) -> Result<Self, Refusal> {
         let object: Object = serde_json::from_slice(body).map_err(|error| {
             refuse("bad_json", format!("the body is not the JSON object that it should be: {error}"))
         })?;
-        let mut all = BTreeMap::new();
+        let (mut all, mut channels) = (BTreeMap::new(), None);
         for (name, value) in object.0 {
+            if name == "channels" {
+                if channels.replace(value).is_some() {
+                    return Err(refuse("duplicate_parameter", format!("{name:?} occurs twice: each may occur once")));
+                }
+                continue;
+            }
             let Some(words) = words(&value, true) else {
                 let right = "must be a number, a text, true or false, or a list of them";
                 return Err(bad_parameter(&name, &value.to_string(), right));
             };
             add(&mut all, name, words)?;
         }
-        Ok(Self(all))
+        Ok(Self(all, channels))
+    }
+
+    /// Takes out the channels.
+    pub(super) fn channels(&mut self) -> Option<Value> {
+        self.1.take()
     }
 
     /// Takes out a parameter.
@@ -148,8 +159,17 @@ impl Parameters {
         Ok(self.choice("leave_out", &choices)?.unwrap_or(true))
     }
 
+    /// Takes out whether tiles lend each other their halos; absent means no.
+    pub(super) fn neighbors(&mut self) -> Result<bool, Refusal> {
+        Ok(self.choice("halo", &[("client", false), ("neighbors", true)])?.unwrap_or(false))
+    }
+
     /// Takes out everything that is left: preset, seed, and the preset's parameters.
     pub(super) fn method(mut self) -> Result<(Method, u64), Refusal> {
+        if self.1.is_some() {
+            let right = "only images with \"halo\": \"neighbors\" are told of channels";
+            return Err(refuse("bad_parameter", format!("channels: {right}")));
+        }
         let preset = self.take("preset").unwrap_or_else(|| DEFAULT_PRESET.to_owned());
         let seed = self.number("seed")?.unwrap_or(0);
         let method = Method::with(&preset, self.0).map_err(|error| {

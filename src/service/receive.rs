@@ -11,7 +11,7 @@ use crate::{
     filter::{
         Rect, TileGeometry,
         geometry::MAX_SIDE,
-        plan::{Plan, Shape, plan},
+        plan::{Plan, Shape},
     },
     wire::{Assembler, Decoder, Event, Header, value::CountReader},
 };
@@ -217,7 +217,7 @@ const fn count_bytes(pixels: u64) -> u64 {
 fn fits(call: &Call, header: &Header, max_per_pixel: u32) -> Result<(Plan, u64), Refusal> {
     let (threads, budget) = (call.service.config.threads, &call.service.budget);
     let shape = Shape { max_per_pixel, ..header.shape() };
-    let plan = plan(&shape, &call.method);
+    let plan = call.plan(&shape);
     let needed = plan.total(threads);
     budget.check(needed).map_err(|error| too_large(error, header, &shape, call))?;
     Ok((plan, needed))
@@ -267,7 +267,7 @@ fn largest_core(header: &Header, shape: &Shape, call: &Call) -> Option<u32> {
             let samples = per_pixel * geometry.window().area();
             let shape = Shape { geometry: &geometry, samples, ..*shape };
             let counts = if shape.varying { count_bytes(geometry.window().area()) } else { 0 };
-            service.budget.check(plan(&shape, &call.method).total(service.config.threads)).is_ok()
+            service.budget.check(call.plan(&shape).total(service.config.threads)).is_ok()
                 && service.requests.check(counts).is_ok()
         })
     };

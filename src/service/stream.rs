@@ -27,18 +27,22 @@ use super::{
     Shared,
     body::Frames,
     charge::{Charge, keep},
-    images::{Id, Image, Outcome},
     metrics::Phase,
     picture::{CorePixels, encode_png, write_file},
     problem::{Refusal, corners, internal},
     query::{Form, Parameters, attributes},
     receive::{Fault, Received, Receiver},
+    registry::{Id, Opened},
     results::{Results, file_response},
     work::{blocking, stopped},
 };
 use crate::{
     admission::Permit,
-    filter::{Execution, Filtered, Method, Rect, SampleTile, filter},
+    filter::{
+        Execution, Filtered, Method, Rect, SampleTile, filter,
+        plan::{Plan, Shape, plan},
+    },
+    image::{Outcome, keeping},
     stitch::ExrOptions,
     wire::{Header, Problem, TileReport, message},
 };
@@ -64,7 +68,7 @@ pub(super) enum Target {
     Client,
     /// Onto an image's canvas.
     Image {
-        image: Arc<Image>,
+        image: Opened,
         /// Whether a stored core made from other samples is replaced.
         replace: bool,
     },
@@ -91,7 +95,15 @@ impl Call {
     pub(super) fn check(&self, header: &Header) -> Result<(), Refusal> {
         match &self.target {
             Target::Client => Ok(()),
-            Target::Image { image, .. } => image.check(header.geometry().image(), header.channels()),
+            Target::Image { image, .. } => image.check(header),
+        }
+    }
+
+    /// Bytes that a tile of this shape will need.
+    pub(super) fn plan(&self, shape: &Shape) -> Plan {
+        match &self.target {
+            Target::Image { image, .. } if image.keeps_samples() => keeping(shape),
+            _ => plan(shape, &self.method),
         }
     }
 
@@ -149,6 +161,7 @@ impl Call {
             Target::Image { image, replace } => {
                 let state = match image.offer(&tile, *replace)? {
                     Outcome::Repeated => "repeated",
+                    Outcome::Stored => "stored",
                     Outcome::Filter(claim) => {
                         let (Done { filtered, report }, _held) = self.filter(tile, held, pool, stop)?;
                         let began = Instant::now();
@@ -157,6 +170,7 @@ impl Call {
                         state
                     }
                 };
+                image.flush(&self.service)?;
                 let line = json!({ "tile": corners(geometry.core()), "state": state });
                 results.append(Some(unread), |out| writeln!(out, "{line}"))?;
                 Ok(state)
@@ -241,11 +255,12 @@ pub(super) async fn image_tiles(
     charge: Charge,
     request: Request,
 ) -> Result<Response, Refusal> {
-    let image = service.images.find(&id)?;
+    let images = Arc::clone(&service);
+    let image = blocking(move || images.images.find(&id)).await??;
     let mut parameters = Parameters::of_query(request.uri())?;
     let replace = parameters.flag("replace")?;
     parameters.done("replace")?;
-    let (method, seed, leave_out) = (Arc::clone(&image.method), image.seed, image.leave_out);
+    let (method, seed, leave_out) = image.method();
     let call = Call::new(service, method, seed, leave_out, Target::Image { image, replace });
     answer(call, charge, request, "application/x-ndjson").await
 }

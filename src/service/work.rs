@@ -47,7 +47,7 @@ impl Work {
         let slot = Arc::clone(&self.slots).acquire_owned().await.map_err(internal)?;
         let pool = Arc::clone(&self.pool);
         let stop = Stop::default();
-        let flag = Arc::clone(&stop.0);
+        let flag = stop.flag();
         let mut running = pin!(blocking(move || {
             let _slot = slot;
             job(&pool, &flag)
@@ -80,7 +80,14 @@ pub(super) async fn blocking<T: Send + 'static>(job: impl FnOnce() -> T + Send +
 
 /// Tells a job to stop when it is dropped: the client has gone, or the job's time is up.
 #[derive(Debug, Default)]
-struct Stop(Arc<AtomicBool>);
+pub(super) struct Stop(Arc<AtomicBool>);
+
+impl Stop {
+    /// What a job looks at.
+    pub(super) fn flag(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.0)
+    }
+}
 
 impl Drop for Stop {
     fn drop(&mut self) {

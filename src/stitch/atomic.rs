@@ -36,7 +36,7 @@ pub struct AtomicError {
 impl AtomicError {
     /// A stable code: `disk-full` or `output-io`.
     pub fn code(&self) -> &'static str {
-        if super::canvas::is_full(&self.source) { "disk-full" } else { "output-io" }
+        if crate::disk::is_full(&self.source) { "disk-full" } else { "output-io" }
     }
 }
 

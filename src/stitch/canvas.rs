@@ -3,12 +3,14 @@
 //! The file holds width x height pixels row by row, R, G, B of a pixel next to each other, as little-endian f32. It is
 //! sparse: pixels that were never written take no space and read as 0. Memory use is one row of whatever is accessed.
 
-use crate::filter::Rect;
+use crate::{
+    disk::{Folder, Storage, is_full},
+    filter::Rect,
+};
 use std::{
-    fs::{File, OpenOptions},
     io,
-    os::unix::fs::FileExt,
     path::{Path, PathBuf},
+    sync::Arc,
 };
 
 /// Bytes of a pixel.
@@ -38,29 +40,36 @@ pub enum CanvasError {
         /// What the size of the image asks for.
         expected: u64,
     },
+    /// Pixels are not those that were written.
+    #[error("{} is damaged: the pixels of tile {core} are not those that were stored", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// The core.
+        core: Rect,
+    },
+    /// Nobody waits for the pixels any more.
+    #[error("the work was stopped")]
+    Stopped,
 }
 
 impl CanvasError {
-    /// A stable code: `disk-full`, `canvas-io`, `canvas-length`.
+    /// A stable code: `disk-full`, `canvas-io`, `damaged`, `stopped`.
     pub fn code(&self) -> &'static str {
         match self {
             Self::Io { source, .. } if is_full(source) => "disk-full",
             Self::Io { .. } => "canvas-io",
-            Self::Length { .. } => "canvas-length",
+            Self::Length { .. } | Self::Damaged { .. } => "damaged",
+            Self::Stopped => "stopped",
         }
     }
 }
 
 impl From<CanvasError> for io::Error {
     fn from(error: CanvasError) -> Self {
-        Self::other(error)
+        let kind = if let CanvasError::Io { source, .. } = &error { source.kind() } else { io::ErrorKind::Other };
+        Self::new(kind, error)
     }
-}
-
-/// Whether an I/O error says that the disk, the quota or the allowed file size is used up.
-pub(crate) fn is_full(error: &io::Error) -> bool {
-    use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
-    matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
 }
 
 /// Something that has linear RGB pixels to be read, rectangle by rectangle.
@@ -72,11 +81,14 @@ pub trait Pixels {
     fn read(&self, rect: Rect, pixels: &mut [[f32; 3]]) -> Result<(), CanvasError>;
 }
 
-/// The file.
-#[derive(Debug)]
+/// What pixels hash to: 16 bytes of BLAKE3 over them as they are in the file, row by row.
+pub type Checksum = [u8; 16];
+
+/// The file. A clone is another handle of the same one.
+#[derive(Clone, Debug)]
 pub struct Canvas {
     image: Rect,
-    file: File,
+    file: Arc<dyn Storage>,
     path: PathBuf,
 }
 
@@ -85,57 +97,88 @@ impl Canvas {
     ///
     /// Width and height are 1 to [`MAX_SIDE`](crate::filter::geometry::MAX_SIDE).
     pub fn temporary(width: u32, height: u32, directory: &Path) -> Result<Self, CanvasError> {
-        let file = tempfile::tempfile_in(directory);
-        Self::sized(width, height, file, directory)
+        let io = |source| CanvasError::Io { action: "create", path: directory.to_owned(), source };
+        let file = tempfile::tempfile_in(directory).map_err(io)?;
+        Self::sized(width, height, Arc::new(file), directory)
     }
 
-    /// A black canvas in a new file, which stays. An error if the file exists.
-    pub fn create(width: u32, height: u32, path: &Path) -> Result<Self, CanvasError> {
-        let file = OpenOptions::new().read(true).write(true).create_new(true).open(path);
-        Self::sized(width, height, file, path)
+    /// A black canvas in a new file of this name, which stays. An error if the file exists.
+    pub fn create(width: u32, height: u32, folder: &dyn Folder, name: &str) -> Result<Self, CanvasError> {
+        let path = folder.path().join(name);
+        let file = folder.create(name);
+        let file = file.map_err(|source| CanvasError::Io { action: "create", path: path.clone(), source })?;
+        Self::sized(width, height, file, &path)
     }
 
     /// A canvas that was made by [`Self::create`] before.
-    pub fn open(width: u32, height: u32, path: &Path) -> Result<Self, CanvasError> {
-        let io = |source| CanvasError::Io { action: "open", path: path.to_owned(), source };
-        let file = OpenOptions::new().read(true).write(true).open(path).map_err(io)?;
-        let (got, image) = (file.metadata().map_err(io)?.len(), Rect::new(0, 0, width, height));
+    pub fn open(width: u32, height: u32, folder: &dyn Folder, name: &str) -> Result<Self, CanvasError> {
+        let path = folder.path().join(name);
+        let io = |source| CanvasError::Io { action: "open", path: path.clone(), source };
+        let file = folder.open(name).map_err(io)?;
+        let (got, image) = (file.len().map_err(io)?, Rect::new(0, 0, width, height));
         let expected = image.area() * PIXEL;
         if got != expected {
-            return Err(CanvasError::Length { path: path.to_owned(), got, expected });
+            return Err(CanvasError::Length { path, got, expected });
         }
-        Ok(Self { image, file, path: path.to_owned() })
+        Ok(Self { image, file, path })
     }
 
-    fn sized(width: u32, height: u32, file: io::Result<File>, path: &Path) -> Result<Self, CanvasError> {
-        let io = |source| CanvasError::Io { action: "create", path: path.to_owned(), source };
-        let canvas = Self { image: Rect::new(0, 0, width, height), file: file.map_err(io)?, path: path.to_owned() };
-        canvas.file.set_len(canvas.image.area() * PIXEL).map_err(io)?;
+    fn sized(width: u32, height: u32, file: Arc<dyn Storage>, path: &Path) -> Result<Self, CanvasError> {
+        let canvas = Self { image: Rect::new(0, 0, width, height), file, path: path.to_owned() };
+        canvas.file.set_len(canvas.image.area() * PIXEL).map_err(|source| canvas.io("create", source))?;
         Ok(canvas)
     }
 
     /// Writes the pixels of `core`, which lies inside the image: planes R, G, B, each one value a pixel, row by row.
     ///
     /// After an error some of the pixels may be written.
-    pub fn write(&self, core: Rect, planes: [&[f32]; 3]) -> Result<(), CanvasError> {
+    pub fn write(&self, core: Rect, planes: [&[f32]; 3]) -> Result<Checksum, CanvasError> {
         debug_assert!(self.image.covers(&core) && planes.iter().all(|plane| plane.len() as u64 == core.area()));
         let width = core.width as usize;
         let mut bytes = Vec::with_capacity(width * PIXEL as usize);
+        let mut hash = blake3::Hasher::new();
         for row in 0..core.height {
             bytes.clear();
             let start = row as usize * width;
             for i in start..start + width {
                 planes.iter().for_each(|plane| bytes.extend_from_slice(&plane[i].to_le_bytes()));
             }
-            let written = self.file.write_all_at(&bytes, self.offset(core.x, core.y + row));
+            hash.update(&bytes);
+            let written = self.file.write(self.offset(core.x, core.y + row), &bytes);
+            written.map_err(|source| self.io("write", source))?;
+        }
+        Ok(short(&hash))
+    }
+
+    /// Refuses pixels of `core` that are not those of which [`Self::write`] said this.
+    pub fn check(&self, core: Rect, expected: &Checksum) -> Result<(), CanvasError> {
+        let mut bytes = vec![0; core.width as usize * PIXEL as usize];
+        let mut hash = blake3::Hasher::new();
+        for y in core.y..core.bottom() {
+            self.read_row(core.x, y, &mut bytes)?;
+            hash.update(&bytes);
+        }
+        if short(&hash) == *expected { Ok(()) } else { Err(CanvasError::Damaged { path: self.path.clone(), core }) }
+    }
+
+    /// Copies all of a canvas onto this one, its corner at the core's. Both have room for it.
+    pub fn paste(&self, core: Rect, from: &Self) -> Result<(), CanvasError> {
+        let mut bytes = vec![0; core.width as usize * PIXEL as usize];
+        for row in 0..core.height {
+            from.read_row(0, row, &mut bytes)?;
+            let written = self.file.write(self.offset(core.x, core.y + row), &bytes);
             written.map_err(|source| self.io("write", source))?;
         }
         Ok(())
     }
 
+    fn read_row(&self, x: u32, y: u32, bytes: &mut [u8]) -> Result<(), CanvasError> {
+        self.file.read(self.offset(x, y), bytes).map_err(|source| self.io("read", source))
+    }
+
     /// Waits until everything written is on the disk.
     pub fn sync(&self) -> Result<(), CanvasError> {
-        self.file.sync_data().map_err(|source| self.io("sync", source))
+        self.file.sync().map_err(|source| self.io("sync", source))
     }
 
     fn offset(&self, x: u32, y: u32) -> u64 {
@@ -147,6 +190,12 @@ impl Canvas {
     }
 }
 
+fn short(hash: &blake3::Hasher) -> Checksum {
+    let mut checksum = [0; 16];
+    checksum.copy_from_slice(&hash.finalize().as_bytes()[..16]);
+    checksum
+}
+
 impl Pixels for Canvas {
     fn image(&self) -> Rect {
         self.image
@@ -156,8 +205,7 @@ impl Pixels for Canvas {
         debug_assert!(self.image.covers(&rect) && pixels.len() as u64 == rect.area());
         let mut bytes = vec![0; rect.width as usize * PIXEL as usize];
         for (y, pixels) in (rect.y..rect.bottom()).zip(pixels.chunks_exact_mut(rect.width as usize)) {
-            let read = self.file.read_exact_at(&mut bytes, self.offset(rect.x, y));
-            read.map_err(|source| self.io("read", source))?;
+            self.read_row(rect.x, y, &mut bytes)?;
             for (value, bytes) in pixels.as_flattened_mut().iter_mut().zip(bytes.as_chunks::<4>().0) {
                 *value = f32::from_le_bytes(*bytes);
             }
@@ -194,19 +242,21 @@ impl Pixels for RgbImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::disk::Directory;
 
     #[test]
     fn keeps_what_was_written_and_is_black_elsewhere() {
         let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("canvas");
-        let canvas = Canvas::create(7, 5, &path).unwrap();
+        let folder = Directory::new(directory.path());
+        let canvas = Canvas::create(7, 5, &folder, "canvas").unwrap();
         let core = Rect::new(2, 1, 3, 2);
         let plane = |c: u32| (0..6).map(|i| (i * 10 + c) as f32).collect::<Vec<_>>();
         let (r, g, b) = (plane(1), plane(2), plane(3));
-        canvas.write(core, [&r, &g, &b]).unwrap();
+        let checksum = canvas.write(core, [&r, &g, &b]).unwrap();
         canvas.sync().unwrap();
         drop(canvas);
-        let canvas = Canvas::open(7, 5, &path).unwrap();
+        let canvas = Canvas::open(7, 5, &folder, "canvas").unwrap();
+        canvas.check(core, &checksum).unwrap();
         let mut pixels = vec![[9.0; 3]; 35];
         canvas.read(canvas.image(), &mut pixels).unwrap();
         for y in 0..5 {
@@ -221,6 +271,13 @@ mod tests {
         let mut part = vec![[9.0; 3]; 4];
         canvas.read(Rect::new(4, 2, 2, 2), &mut part).unwrap();
         assert_eq!(part, [[51.0, 52.0, 53.0], [0.0; 3], [0.0; 3], [0.0; 3]]);
+        // A single bit in it, and one beside it.
+        canvas.write(Rect::new(5, 1, 1, 1), [&[1.0], &[2.0], &[3.0]]).unwrap();
+        canvas.check(core, &checksum).unwrap();
+        canvas.write(Rect::new(4, 2, 1, 1), [&[51.0], &[52.0], &[f32::from_bits(53.0f32.to_bits() ^ 1)]]).unwrap();
+        let error = canvas.check(core, &checksum).unwrap_err();
+        assert_eq!(error.code(), "damaged");
+        assert!(error.to_string().contains("canvas is damaged: the pixels of tile [2, 1, 3, 2]"), "{error}");
     }
 
     #[test]
@@ -238,16 +295,14 @@ mod tests {
         let error = Canvas::temporary(1, 1, &missing).unwrap_err();
         assert_eq!(error.code(), "canvas-io");
         assert!(error.to_string().contains(missing.to_str().unwrap()), "{error}");
-        let path = directory.path().join("canvas");
-        drop(Canvas::create(2, 2, &path).unwrap());
-        assert_eq!(Canvas::create(2, 2, &path).unwrap_err().code(), "canvas-io");
-        assert_eq!(Canvas::open(2, 3, &path).unwrap_err().code(), "canvas-length");
+        let folder = Directory::new(directory.path());
+        drop(Canvas::create(2, 2, &folder, "canvas").unwrap());
+        let error = Canvas::create(2, 2, &folder, "canvas").unwrap_err();
+        assert!(error.code() == "canvas-io" && error.to_string().contains("/canvas"), "{error}");
+        assert_eq!(Canvas::open(2, 3, &folder, "canvas").unwrap_err().code(), "damaged");
         // /dev/full takes no byte.
-        let full = Canvas {
-            image: Rect::new(0, 0, 1, 1),
-            file: File::options().read(true).write(true).open("/dev/full").unwrap(),
-            path,
-        };
+        let file = std::fs::File::options().read(true).write(true).open("/dev/full").unwrap();
+        let full = Canvas { image: Rect::new(0, 0, 1, 1), file: Arc::new(file), path: "/dev/full".into() };
         assert_eq!(full.write(Rect::new(0, 0, 1, 1), [&[1.0], &[2.0], &[3.0]]).unwrap_err().code(), "disk-full");
     }
 }

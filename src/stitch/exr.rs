@@ -7,9 +7,9 @@
 
 use super::{
     atomic::{AtomicError, AtomicFile},
-    canvas::{CanvasError, Pixels, RgbImage, is_full},
+    canvas::{CanvasError, Pixels, RgbImage},
 };
-use crate::filter::Rect;
+use crate::{disk::is_full, filter::Rect};
 use ::exr::{
     block::{BlockIndex, UncompressedBlock, reader::ChunksReader},
     compression::Compression,

@@ -131,6 +131,11 @@ impl Claim {
     pub const fn core(&self) -> Rect {
         self.core
     }
+
+    /// The digest of its samples.
+    pub const fn digest(&self) -> Digest {
+        self.digest
+    }
 }
 
 /// What became of a delivered core.
@@ -140,6 +145,17 @@ pub enum Added {
     Stored,
     /// The same core from the same samples came first.
     Repeated,
+}
+
+/// What a claim will do to the image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// The core is new on the canvas.
+    New,
+    /// It takes the place of one that is stored.
+    Replaces,
+    /// Nothing: the same core from the same samples came first.
+    Repeats,
 }
 
 #[derive(Debug)]
@@ -163,6 +179,12 @@ struct Pending {
     alive: Weak<()>,
 }
 
+impl Pending {
+    fn is(&self, claim: &Claim) -> bool {
+        self.alive.as_ptr() == Arc::as_ptr(&claim.alive)
+    }
+}
+
 #[derive(Debug, Default)]
 struct Entry {
     stored: Option<Stored>,
@@ -172,6 +194,13 @@ struct Entry {
 impl Entry {
     fn forget_dead(&mut self) {
         self.pending.retain(|pending| pending.alive.strong_count() > 0);
+    }
+}
+
+/// Counts the planes that a report says were left out, and takes them from it.
+fn count(sums: &mut BTreeMap<(String, &'static str), u64>, report: &mut Report) {
+    for LeftOut { plane, reason } in std::mem::take(&mut report.left_out) {
+        *sums.entry((plane, reason.as_str())).or_default() += 1;
     }
 }
 
@@ -292,38 +321,76 @@ impl Stitcher {
         Ok(Offer::Filter(claim))
     }
 
+    /// Says what [`Self::add`] will do.
+    pub fn judge(&self, claim: &Claim) -> Result<Verdict, StitchError> {
+        let core = claim.core;
+        // The entry lives as long as the claim, unless the claim is another image's.
+        let entry = self.coverage.get(&core).ok_or(StitchError::Mismatch(core))?;
+        if !entry.pending.iter().any(|pending| pending.is(claim)) {
+            return Err(StitchError::Mismatch(core));
+        }
+        match &entry.stored {
+            None => Ok(Verdict::New),
+            Some(stored) if stored.done_with(claim.digest, claim.replace) => Ok(Verdict::Repeats),
+            Some(stored) if stored.turn > claim.turn => Err(StitchError::Superseded(core)),
+            Some(stored) if stored.digest != claim.digest && !claim.replace => Err(StitchError::Conflict(core)),
+            Some(_) => Ok(Verdict::Replaces),
+        }
+    }
+
     /// Puts a filtered core on the canvas. If that fails the core is missing afterwards.
     pub fn add(&mut self, claim: Claim, filtered: &Filtered) -> Result<Added, StitchError> {
         let core = claim.core;
-        let area = core.area();
-        if filtered.core != core || filtered.rgb.iter().any(|plane| plane.len() as u64 != area) {
+        if filtered.core != core || filtered.rgb.iter().any(|plane| plane.len() as u64 != core.area()) {
+            self.release(&claim);
             return Err(StitchError::Mismatch(core));
         }
-        // The entry lives as long as the claim, unless the claim is another image's.
-        let entry = self.coverage.get_mut(&core).ok_or(StitchError::Mismatch(core))?;
-        let mine = entry.pending.iter().position(|pending| pending.alive.as_ptr() == Arc::as_ptr(&claim.alive));
-        entry.pending.swap_remove(mine.ok_or(StitchError::Mismatch(core))?);
-        match &mut entry.stored {
-            Some(stored) if stored.done_with(claim.digest, claim.replace) => {
-                stored.turn = stored.turn.max(claim.turn);
+        let [r, g, b] = &filtered.rgb;
+        let canvas = self.canvas.clone();
+        self.add_with(claim, &filtered.report, || canvas.write(core, [r, g, b]).map(drop))
+    }
+
+    /// As [`Self::add`], `write` putting the pixels on the canvas.
+    pub fn add_with(
+        &mut self,
+        claim: Claim,
+        report: &Report,
+        write: impl FnOnce() -> Result<(), CanvasError>,
+    ) -> Result<Added, StitchError> {
+        let core = claim.core;
+        let verdict = self.judge(&claim);
+        let mismatch = || StitchError::Mismatch(core);
+        let entry = self.coverage.get_mut(&core).ok_or_else(mismatch)?;
+        entry.pending.retain(|pending| !pending.is(&claim));
+        match verdict? {
+            Verdict::Repeats => {
+                if let Some(stored) = &mut entry.stored {
+                    stored.turn = stored.turn.max(claim.turn);
+                }
                 return Ok(Added::Repeated);
             }
-            Some(stored) if stored.turn > claim.turn => return Err(StitchError::Superseded(core)),
-            Some(stored) if stored.digest != claim.digest && !claim.replace => return Err(StitchError::Conflict(core)),
-            _ => {}
+            Verdict::Replaces => {
+                entry.stored = None;
+                self.done -= core.area();
+            }
+            Verdict::New => {}
         }
-        if entry.stored.take().is_some() {
-            self.done -= area;
-        }
-        let [r, g, b] = &filtered.rgb;
-        self.canvas.write(core, [r, g, b])?;
-        let mut report = filtered.report.clone();
-        for LeftOut { plane, reason } in std::mem::take(&mut report.left_out) {
-            *self.left_out.entry((plane, reason.as_str())).or_default() += 1;
-        }
+        write()?;
+        let mut report = report.clone();
+        count(&mut self.left_out, &mut report);
         entry.stored = Some(Stored { digest: claim.digest, turn: claim.turn, report });
-        self.done += area;
+        self.done += core.area();
         Ok(Added::Stored)
+    }
+
+    /// Gives a claim up, and forgets its core if nobody else has claimed it.
+    pub fn release(&mut self, claim: &Claim) {
+        let Some(entry) = self.coverage.get_mut(&claim.core) else { return };
+        entry.forget_dead();
+        entry.pending.retain(|pending| !pending.is(claim));
+        if entry.stored.is_none() && entry.pending.is_empty() {
+            self.coverage.remove(&claim.core);
+        }
     }
 
     /// Counts a core as stored that is on the canvas already, after a restart. Cores that are known or claimed are
@@ -333,6 +400,8 @@ impl Stitcher {
         if self.coverage.get(&core).is_some() {
             return Err(StitchError::Conflict(core));
         }
+        let mut report = report;
+        count(&mut self.left_out, &mut report);
         self.insert(core, Entry { stored: Some(Stored { digest, turn: 0, report }), pending: Vec::new() })?;
         self.done += core.area();
         Ok(())
@@ -385,6 +454,16 @@ impl Stitcher {
         self.coverage.missing_but(&self.image(), |entry| entry.stored.is_some())
     }
 
+    /// The parts of a rectangle that are not stored.
+    pub fn missing_in(&self, rect: &Rect) -> Vec<Rect> {
+        self.coverage.missing_but(rect, |entry| entry.stored.is_some())
+    }
+
+    /// The digest of the samples of a stored core.
+    pub fn peek(&self, core: &Rect) -> Option<Digest> {
+        Some(self.coverage.get(core)?.stored.as_ref()?.digest)
+    }
+
     /// The stored tiles by rows, with their reports.
     pub fn tiles(&self) -> impl Iterator<Item = (Rect, &Report)> {
         self.coverage.iter().filter_map(|(core, entry)| Some((core, &entry.stored.as_ref()?.report)))
@@ -419,9 +498,9 @@ impl Stitcher {
     }
 
     /// The stored pixels, black where they are missing.
-    pub fn pixels(&self) -> StoredPixels<'_> {
+    pub fn pixels(&self) -> StoredPixels {
         let missing = if self.is_complete() { Vec::new() } else { self.missing() };
-        StoredPixels { canvas: &self.canvas, missing }
+        StoredPixels { canvas: self.canvas.clone(), missing }
     }
 
     /// Writes the image as an EXR file: complete, durable and under its name, or not at all.
@@ -454,14 +533,15 @@ impl Stitcher {
     }
 }
 
-/// The pixels of a [`Stitcher`]; those that are missing are black, whatever an interrupted write left on the canvas.
+/// The pixels of a [`Stitcher`] at a moment; those that are missing are black, whatever an interrupted write left on the
+/// canvas. Cores that are stored later do not show, unless they replace one.
 #[derive(Debug)]
-pub struct StoredPixels<'a> {
-    canvas: &'a Canvas,
+pub struct StoredPixels {
+    canvas: Canvas,
     missing: Vec<Rect>,
 }
 
-impl Pixels for StoredPixels<'_> {
+impl Pixels for StoredPixels {
     fn image(&self) -> Rect {
         self.canvas.image()
     }

@@ -9,12 +9,12 @@
 
 use std::{io, path::Path};
 
-use super::backing::Backing;
+use super::{
+    backing::Backing,
+    cut::{Part, cut},
+};
 use crate::{
-    filter::{
-        ChannelSet, Counts, Coverage, Plane, Rect, SampleTile, TileGeometry,
-        samples::{SampleError, sample_total},
-    },
+    filter::{ChannelSet, Coverage, Rect, SampleTile, TileGeometry, samples::SampleError},
     wire::{
         Event, Format, Header, SampleCounts,
         value::{CountReader, ValueReader},
@@ -325,115 +325,60 @@ impl Spool {
         if geometry.image() != *image {
             return Err(SpoolError::Disagreement { tile, what: "the size of the image" });
         }
-        let parts = self.tiles.meeting(&window);
-        let layout = self.layout(&window, &parts)?;
-        let planes = (0..channels.planes()).map(|plane| self.plane(&window, &parts, &layout, plane));
-        let planes = planes.collect::<Result<Vec<_>, _>>()?;
-        Ok(SampleTile::new(geometry, channels.clone(), layout.into_counts(), planes)?)
+        let backing = &self.backing;
+        let meeting = self.tiles.meeting(&window).into_iter();
+        let parts: Vec<_> = meeting.map(|(core, stored)| (core, SpoolPart { stored, backing })).collect();
+        cut(geometry, channels, &parts)
     }
+}
 
-    /// Where each pixel's samples go.
-    fn layout(&self, window: &Rect, parts: &[(Rect, &Stored)]) -> Result<Layout, SpoolError> {
-        let mut uniform = parts.iter().map(|(_, stored)| match stored.samples {
+/// A core, and where its bytes are.
+struct SpoolPart<'a> {
+    stored: &'a Stored,
+    backing: &'a Backing,
+}
+
+impl Part for SpoolPart<'_> {
+    fn uniform(&self) -> Option<u32> {
+        match self.stored.samples {
             StoredSamples::Uniform(n) => Some(n),
             StoredSamples::Varying { .. } => None,
-        });
-        let first = uniform.next().flatten();
-        let counts = match first {
-            Some(n) if uniform.all(|other| other == first) && covered(window, parts) => Counts::Uniform(n),
-            _ => {
-                let mut counts = vec![0; window.area() as usize];
-                let mut bytes = Vec::new();
-                for (core, stored) in parts {
-                    let Some(part) = core.intersection(window) else { continue };
-                    for y in part.y..part.bottom() {
-                        let at = window.index(part.x, y);
-                        let row = &mut counts[at..at + part.width as usize];
-                        match &stored.samples {
-                            StoredSamples::Uniform(n) => row.fill(*n as u16),
-                            StoredSamples::Varying { offset, .. } => {
-                                let from = offset + 2 * core.index(part.x, y) as u64;
-                                self.read_counts(from, part.width, &mut bytes)?;
-                                let (values, _) = bytes.as_chunks::<2>();
-                                row.iter_mut().zip(values).for_each(|(to, from)| *to = u16::from_le_bytes(*from));
-                            }
-                        }
-                    }
-                }
-                Counts::Varying(counts)
-            }
-        };
-        let total = sample_total(window.area(), &counts)? as usize;
-        let mut rows = Vec::with_capacity(window.height as usize + 1);
-        if let Counts::Varying(counts) = &counts {
-            let mut at = 0;
-            rows.push(0);
-            rows.extend(counts.chunks(window.width as usize).map(|row| {
-                at += sum(row);
-                at
-            }));
         }
-        Ok(Layout { counts, rows, total })
     }
 
-    fn read_counts(&self, offset: u64, pixels: u32, bytes: &mut Vec<u8>) -> io::Result<()> {
-        bytes.resize(2 * pixels as usize, 0);
-        self.backing.read(offset, bytes)
+    fn counts(&self, pixel: u64, into: &mut [u16]) -> io::Result<()> {
+        let StoredSamples::Varying { offset, .. } = &self.stored.samples else { return Ok(()) };
+        let mut bytes = vec![0; 2 * into.len()];
+        self.backing.read(offset + 2 * pixel, &mut bytes)?;
+        into.iter_mut().zip(bytes.as_chunks::<2>().0).for_each(|(to, from)| *to = u16::from_le_bytes(*from));
+        Ok(())
     }
 
-    fn plane(
-        &self,
-        window: &Rect,
-        parts: &[(Rect, &Stored)],
-        layout: &Layout,
-        plane: usize,
-    ) -> Result<Plane, SpoolError> {
-        let constant = |stored: &Stored| match stored.planes[plane] {
+    fn row_start(&self, row: u32) -> io::Result<u64> {
+        match &self.stored.samples {
+            StoredSamples::Varying { rows, .. } => Ok(rows[row as usize]),
+            StoredSamples::Uniform(_) => Ok(0),
+        }
+    }
+
+    fn constant(&self, plane: usize) -> Option<f32> {
+        match self.stored.planes[plane] {
             StoredPlane::Constant(value) => Some(value),
             StoredPlane::Values { .. } => None,
-        };
-        if let Some(value) = parts.first().and_then(|(_, stored)| constant(stored)) {
-            let same = |other: f32| other == value || (other.is_nan() && value.is_nan());
-            if parts.iter().all(|(_, stored)| constant(stored).is_some_and(same)) {
-                return Ok(Plane::Constant(value));
-            }
         }
-        let mut values = vec![0.0; layout.total];
-        let mut bytes = Vec::new();
-        for (core, stored) in parts {
-            let Some(part) = core.intersection(window) else { continue };
-            for y in part.y..part.bottom() {
-                let into = layout.range(window, part.x, part.right(), y);
-                let into = &mut values[into];
-                let (offset, format) = match stored.planes[plane] {
-                    StoredPlane::Constant(value) => {
-                        into.fill(value);
-                        continue;
-                    }
-                    StoredPlane::Values { offset, format } => (offset, format),
-                };
-                let from = match &stored.samples {
-                    StoredSamples::Uniform(n) => core.index(part.x, y) as u64 * u64::from(*n),
-                    StoredSamples::Varying { offset, rows } => {
-                        let row = core.index(core.x, y) as u64;
-                        let ahead = part.x - core.x;
-                        self.read_counts(offset + 2 * row, ahead, &mut bytes)?;
-                        let mut from = rows[(y - core.y) as usize];
-                        CountReader::default().push(&bytes, |count| from += u64::from(count));
-                        from
-                    }
-                };
-                bytes.resize(into.len() * format.bytes() as usize, 0);
-                self.backing.read(offset + from * format.bytes(), &mut bytes)?;
-                let mut slots = into.iter_mut();
-                ValueReader::new(format).push(&bytes, |value| {
-                    if let Some(slot) = slots.next() {
-                        *slot = value;
-                    }
-                });
+    }
+
+    fn values(&self, plane: usize, sample: u64, into: &mut [f32]) -> io::Result<()> {
+        let StoredPlane::Values { offset, format } = self.stored.planes[plane] else { return Ok(()) };
+        let mut bytes = vec![0; into.len() * format.bytes() as usize];
+        self.backing.read(offset + sample * format.bytes(), &mut bytes)?;
+        let mut slots = into.iter_mut();
+        ValueReader::new(format).push(&bytes, |value| {
+            if let Some(slot) = slots.next() {
+                *slot = value;
             }
-        }
-        Ok(Plane::Values(values))
+        });
+        Ok(())
     }
 }
 
@@ -470,41 +415,4 @@ impl Open {
         self.cursor.byte = to;
         Ok(())
     }
-}
-
-/// Where the samples of a data window go.
-struct Layout {
-    counts: Counts,
-    /// With varying samples the position at which each row of the window starts, and their end.
-    rows: Vec<usize>,
-    total: usize,
-}
-
-impl Layout {
-    /// The samples of the pixels `left..right` of a row.
-    fn range(&self, window: &Rect, left: u32, right: u32, y: u32) -> std::ops::Range<usize> {
-        let first = window.index(left, y);
-        let pixels = first..first + (right - left) as usize;
-        match &self.counts {
-            Counts::Uniform(n) => pixels.start * *n as usize..pixels.end * *n as usize,
-            Counts::Varying(counts) => {
-                let start = self.rows[(y - window.y) as usize] + sum(&counts[window.index(window.x, y)..pixels.start]);
-                start..start + sum(&counts[pixels])
-            }
-        }
-    }
-
-    fn into_counts(self) -> Counts {
-        self.counts
-    }
-}
-
-/// Whether these cores, which do not overlap, cover all of a window.
-fn covered(window: &Rect, parts: &[(Rect, &Stored)]) -> bool {
-    let areas = parts.iter().filter_map(|(core, _)| core.intersection(window));
-    areas.map(|part| part.area()).sum::<u64>() == window.area()
-}
-
-fn sum(counts: &[u16]) -> usize {
-    counts.iter().map(|&n| usize::from(n)).sum()
 }

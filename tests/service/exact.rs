@@ -6,7 +6,7 @@ use crate::{
     stitch::shuffle,
 };
 use rpfd::{
-    filter::{Execution, Method, Rect, TileGeometry, filter, geometry::tiling},
+    filter::{Execution, Method, Rect, SampleTile, TileGeometry, filter, geometry::tiling},
     stitch::{
         ExrOptions, RgbImage,
         exr::{self, provenance},
@@ -18,17 +18,20 @@ use rpfd::{
 const SIDE: u32 = 48;
 const IMAGE: [u32; 2] = [SIDE, SIDE];
 
-/// The EXR of the whole image, filtered in this process.
-fn offline(method: &Method, seed: u64) -> Vec<u8> {
-    let tile = samples(IMAGE, Rect::new(0, 0, SIDE, SIDE), 0, 1);
-    let filtered = filter(&tile, method, &Execution { seed, ..Execution::default() }).unwrap();
+/// The EXR of a whole image, filtered in this process.
+pub(crate) fn whole_exr(tile: &SampleTile, method: &Method, seed: u64) -> Vec<u8> {
+    let filtered = filter(tile, method, &Execution { seed, ..Execution::default() }).unwrap();
     let [r, g, b] = &filtered.rgb;
     let pixels = r.iter().zip(g).zip(b).map(|((&r, &g), &b)| [r, g, b]).collect();
-    let image = RgbImage { width: SIDE, height: SIDE, pixels };
+    let image = RgbImage { width: filtered.core.width, height: filtered.core.height, pixels };
     let attributes = provenance(method.preset_name(), seed, method.parameters());
     let mut bytes = std::io::Cursor::new(Vec::new());
     exr::encode(&image, &ExrOptions { attributes, ..ExrOptions::default() }, &mut bytes).unwrap();
     bytes.into_inner()
+}
+
+fn offline(method: &Method, seed: u64) -> Vec<u8> {
+    whole_exr(&samples(IMAGE, Rect::new(0, 0, SIDE, SIDE), 0, 1), method, seed)
 }
 
 #[test]

@@ -6,11 +6,13 @@ mod codes;
 mod config;
 mod curl;
 mod deploy;
-mod exact;
+mod durable;
+pub(crate) mod exact;
 pub(crate) mod flow;
 mod http2;
 mod images;
 mod limits;
+pub(crate) mod neighbors;
 mod observe;
 mod openapi;
 mod proxy;
@@ -38,7 +40,7 @@ pub(crate) struct Server {
     pub(crate) address: String,
     /// Where its metrics are, if it was told to have any.
     metrics: Option<String>,
-    folder: tempfile::TempDir,
+    folder: Option<tempfile::TempDir>,
 }
 
 impl Server {
@@ -48,21 +50,32 @@ impl Server {
 
     /// As `start`, with the log in a file.
     pub(crate) fn start_logging(arguments: &[&str], log: Option<&Path>) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let mut child = Command::new(env!("CARGO_BIN_EXE_rpfd"))
+        let mut command = Command::new(env!("CARGO_BIN_EXE_rpfd"));
+        command.stderr(log.map_or_else(Stdio::inherit, |path| std::fs::File::create(path).unwrap().into()));
+        Self::start_by(command, tempfile::tempdir().unwrap(), arguments)
+    }
+
+    /// One that finds what was in its data folder before.
+    pub(crate) fn start_in(folder: tempfile::TempDir, arguments: &[&str]) -> Self {
+        let command = Command::new(env!("CARGO_BIN_EXE_rpfd"));
+        Self::start_by(command, folder, arguments)
+    }
+
+    /// One that is started by another program, whose arguments it follows.
+    pub(crate) fn start_by(mut command: Command, folder: tempfile::TempDir, arguments: &[&str]) -> Self {
+        let mut child = command
             .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
             .arg(folder.path())
             .args(arguments)
             .env("RUST_LOG", if arguments.contains(&"--log-format") { "info" } else { "warn" })
             .stdout(Stdio::piped())
-            .stderr(log.map_or_else(Stdio::inherit, |path| std::fs::File::create(path).unwrap().into()))
             .spawn()
             .unwrap();
         let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
         let mut address = || lines.next()?.unwrap().rsplit("//").next().map(ToOwned::to_owned);
         let (first, second) = (address().expect("the service did not start"), arguments.contains(&"--metrics-listen"));
         let metrics = if second { address().map(|address| address.replace("/metrics", "")) } else { None };
-        Self { child, address: first, metrics, folder }
+        Self { child, address: first, metrics, folder: Some(folder) }
     }
 
     /// What it counts now.
@@ -86,7 +99,18 @@ impl Server {
     }
 
     pub(crate) fn data_dir(&self) -> &Path {
-        self.folder.path()
+        self.folder.as_ref().unwrap().path()
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Kills it at once, and gives what it has left.
+    pub(crate) fn kill(mut self) -> tempfile::TempDir {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+        self.folder.take().unwrap()
     }
 
     pub(crate) fn connect(&self) -> TcpStream {
@@ -115,18 +139,17 @@ impl Server {
         self.call("POST", path, &[], body)
     }
 
-    pub(crate) fn pid(&self) -> u32 {
-        self.child.id()
-    }
-
     /// Tells it to stop, and says how it ended.
     pub(crate) fn terminate(self) -> std::process::ExitStatus {
-        self.signal("-TERM");
-        self.ended()
+        self.terminated().0
     }
-}
 
-impl Server {
+    /// The same, and gives what it has left.
+    pub(crate) fn terminated(mut self) -> (std::process::ExitStatus, tempfile::TempDir) {
+        self.signal("-TERM");
+        (self.child.wait().unwrap(), self.folder.take().unwrap())
+    }
+
     /// Says how it ended, when it does.
     pub(crate) fn ended(mut self) -> std::process::ExitStatus {
         self.child.wait().unwrap()
@@ -268,6 +291,17 @@ pub(crate) fn encode(tile: &SampleTile) -> Vec<u8> {
 
 pub(crate) fn tile(image: [u32; 2], core: Rect, halo: u32) -> Vec<u8> {
     encode(&samples(image, core, halo, 1))
+}
+
+/// Waits until a question is answered with yes; long enough for the slowest machine.
+pub(crate) fn wait_for(what: &str, mut done: impl FnMut() -> bool) {
+    for _ in 0..1200 {
+        if done() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    panic!("waited in vain for {what}");
 }
 
 /// A small image as one tile.

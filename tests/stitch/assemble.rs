@@ -180,14 +180,14 @@ fn a_result_that_was_not_claimed_is_refused() {
 #[test]
 fn a_kept_canvas_is_taken_up_again() {
     let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("canvas");
-    let mut first = Stitcher::on(Canvas::create(64, 48, &path).unwrap());
+    let folder = rpfd::disk::Directory::new(directory.path());
+    let mut first = Stitcher::on(Canvas::create(64, 48, &folder, "canvas").unwrap());
     let cores: Vec<Rect> = tiling([64, 48], 24).collect();
     cores.iter().for_each(|&core| put(&mut first, core));
     first.canvas().sync().unwrap();
     drop(first);
     // All cores are on the canvas, but the last was never recorded: its pixels do not count, and do not show.
-    let mut again = Stitcher::on(Canvas::open(64, 48, &path).unwrap());
+    let mut again = Stitcher::on(Canvas::open(64, 48, &folder, "canvas").unwrap());
     let (last, recorded) = cores.split_last().unwrap();
     for &core in recorded {
         again.restore(core, digest(1), filtered(core).report).unwrap();

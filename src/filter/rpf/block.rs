@@ -5,7 +5,7 @@
 //! cache while the block is worked on: a candidate is tested, and a row gathered, from one or two lines of memory.
 
 use super::relevance::{Relevant, Source};
-use crate::filter::lanes::{LANES, Lanes, Simd, prelude::*, transpose};
+use crate::filter::lanes::{HALF, Half, LANES, Simd, prelude::*, transpose};
 use crate::filter::samples::SampleLayout;
 use crate::filter::{Plane, Rect, SampleTile};
 
@@ -220,42 +220,47 @@ fn copy_row<S: Simd>(
     for line in 0..lines {
         let mut planes = [&Plane::Constant(0.0); LANES];
         planes.iter_mut().zip(&mut sources).for_each(|(place, plane)| *place = plane);
-        for start in samples.clone().step_by(LANES) {
-            let count = LANES.min(samples.end - start);
-            let mut values = [Lanes::splat(simd, 0.0); LANES];
-            for (place, plane) in values.iter_mut().zip(planes) {
-                *place = match plane {
-                    Plane::Constant(value) => Lanes::splat(simd, *value),
-                    Plane::Values(values) if count == LANES => Lanes::from_slice(simd, &values[start..start + LANES]),
-                    Plane::Values(values) => {
-                        let mut few = [0.0; LANES];
-                        few[..count].copy_from_slice(&values[start..start + count]);
-                        Lanes::from_slice(simd, &few)
-                    }
-                };
-            }
-            transpose(&mut values);
-            let place = records[(first + start - samples.start) * lines + line..].iter_mut().step_by(lines);
-            for (record, value) in place.zip(&values[..count]) {
-                value.store_slice(&mut record.0);
+        for start in samples.clone().step_by(HALF) {
+            let count = HALF.min(samples.end - start);
+            for part in (0..LANES).step_by(HALF) {
+                let mut values = [Half::splat(simd, 0.0); HALF];
+                for (place, plane) in values.iter_mut().zip(&planes[part..part + HALF]) {
+                    *place = match plane {
+                        Plane::Constant(value) => Half::splat(simd, *value),
+                        Plane::Values(values) if count == HALF => Half::from_slice(simd, &values[start..start + HALF]),
+                        Plane::Values(values) => {
+                            let mut few = [0.0; HALF];
+                            few[..count].copy_from_slice(&values[start..start + count]);
+                            Half::from_slice(simd, &few)
+                        }
+                    };
+                }
+                transpose(&mut values);
+                let place = records[(first + start - samples.start) * lines + line..].iter_mut().step_by(lines);
+                for (record, value) in place.zip(&values[..count]) {
+                    value.store_slice(&mut record.0[part..part + HALF]);
+                }
             }
         }
     }
 }
 
-/// Records as columns, 16 rows by 16 columns at a time.
+/// Records as columns, 8 rows by 8 columns at a time.
 #[inline(always)]
 fn gather_columns<S: Simd>(simd: S, records: &[Line], lines: usize, rows: &[u32], columns: &mut [f32], stride: usize) {
     for line in 0..lines {
         let columns = &mut columns[line * LANES * stride..][..LANES * stride];
-        for (chunk, rows) in rows.chunks_exact(LANES).enumerate() {
-            let mut values = [Lanes::splat(simd, 0.0); LANES];
-            for (place, &row) in values.iter_mut().zip(rows) {
-                *place = Lanes::from_slice(simd, &records[row as usize * lines + line].0);
-            }
-            transpose(&mut values);
-            for (value, column) in values.iter().zip(columns.chunks_exact_mut(stride)) {
-                value.store_slice(&mut column[chunk * LANES..][..LANES]);
+        for (chunk, rows) in rows.chunks_exact(HALF).enumerate() {
+            for part in (0..LANES).step_by(HALF) {
+                let mut values = [Half::splat(simd, 0.0); HALF];
+                for (place, &row) in values.iter_mut().zip(rows) {
+                    let record = &records[row as usize * lines + line].0;
+                    *place = Half::from_slice(simd, &record[part..part + HALF]);
+                }
+                transpose(&mut values);
+                for (value, column) in values.iter().zip(columns[part * stride..].chunks_exact_mut(stride)) {
+                    value.store_slice(&mut column[chunk * HALF..][..HALF]);
+                }
             }
         }
     }

@@ -1,0 +1,498 @@
+//! All images of the service, by id: in memory while they are used, else on the disk only.
+
+use std::{
+    collections::BTreeMap,
+    fs::{self, File},
+    hash::{BuildHasher, RandomState},
+    io,
+    path::{Path, PathBuf},
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+    time::{Duration, SystemTime, UNIX_EPOCH},
+};
+
+use axum::{
+    extract::{FromRequestParts, Path as UrlPath},
+    http::{StatusCode, request::Parts},
+};
+use serde_json::{Value, json};
+use tokio::sync::Notify;
+
+use super::{Shared, problem::Refusal, regions};
+use crate::{
+    config::Config,
+    disk::Directory,
+    image::{self, Description, Image, ImageError},
+    wire::Problem,
+};
+
+/// Most bytes of an id.
+const MAX_ID: usize = 128;
+/// Folder of the images in the data folder, and the file that one service at a time holds.
+const IMAGES: &str = "images";
+const LOCK: &str = "rpfd.lock";
+/// How long an image that nobody uses stays in memory.
+const LINGER: Duration = Duration::from_secs(30);
+/// How often the time of the last use is written down.
+const TOUCH: Duration = Duration::from_secs(60);
+
+/// The id of an image, from the path of a request.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(super) struct Id(pub(super) String);
+
+impl<S: Send + Sync> FromRequestParts<S> for Id {
+    type Rejection = Refusal;
+
+    async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Refusal> {
+        // What is not even text is no image's id.
+        let id = UrlPath::<String>::from_request_parts(parts, state).await;
+        id.map(|UrlPath(id)| Self(id)).map_err(|error| no_image(&error.body_text()))
+    }
+}
+
+impl Id {
+    /// An id that a client has chosen, if it can be one.
+    pub(super) fn chosen(id: &str) -> Option<Self> {
+        let fine = |b: u8| b.is_ascii_alphanumeric() || b"._-".contains(&b);
+        let fine = (1..=MAX_ID).contains(&id.len()) && id.bytes().all(fine) && !id.starts_with('.');
+        fine.then(|| Self(id.to_owned()))
+    }
+
+    /// An id that nobody has.
+    pub(super) fn new() -> Self {
+        let random = || RandomState::new().hash_one("image");
+        Self(format!("{:016x}{:016x}", random(), random()))
+    }
+}
+
+pub(super) fn no_image(id: &str) -> Refusal {
+    let detail = format!("there is no image {id:?}: it was never opened, or is forgotten");
+    Refusal::new(StatusCode::NOT_FOUND, "unknown_image", "There is no such image", detail)
+}
+
+/// An image by its id.
+#[derive(Debug)]
+pub(super) struct Entry {
+    pub(super) id: Id,
+    /// Bytes of disk that are set aside for it.
+    disk: u64,
+    /// Seconds since 1970 at which it was last used, and at which that was written down.
+    touched: AtomicU64,
+    written: AtomicU64,
+    slot: Mutex<Slot>,
+    /// One result at a time is made.
+    pub(super) encoding: tokio::sync::Mutex<()>,
+    pub(super) runner: regions::Runner,
+}
+
+#[derive(Debug)]
+enum Slot {
+    /// On the disk only; its summary as it was last.
+    Closed(Value),
+    Open(Arc<Image>),
+    /// Its files are not what was written.
+    Damaged(String),
+    Gone,
+}
+
+/// An image in memory.
+#[derive(Clone, Debug)]
+pub(super) struct Opened {
+    pub(super) entry: Arc<Entry>,
+    pub(super) image: Arc<Image>,
+}
+
+impl Entry {
+    fn new(id: Id, disk: u64, touched: u64, slot: Slot) -> Self {
+        Self {
+            id,
+            disk,
+            touched: touched.into(),
+            written: touched.into(),
+            slot: Mutex::new(slot),
+            encoding: tokio::sync::Mutex::new(()),
+            runner: regions::Runner { running: AtomicBool::new(false), wake: Notify::new(), trouble: Mutex::default() },
+        }
+    }
+
+    fn slot(&self) -> MutexGuard<'_, Slot> {
+        self.slot.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Seconds since 1970 at which it was last used.
+    pub(super) fn touched(&self) -> u64 {
+        self.touched.load(Ordering::Relaxed)
+    }
+}
+
+/// All of them.
+#[derive(Debug)]
+pub(super) struct Images {
+    all: Mutex<BTreeMap<Id, Arc<Entry>>>,
+    folder: PathBuf,
+    limit: usize,
+    /// Bytes of disk for all images, and those of images that are just being removed.
+    disk: u64,
+    leaving: AtomicU64,
+    /// How long an image is kept that nobody uses.
+    ttl: Duration,
+    /// Held as long as this lives.
+    _lock: File,
+}
+
+/// Why there are no images.
+#[derive(Debug)]
+pub(super) enum StartError {
+    /// Another service has the folder.
+    InUse,
+    Io(io::Error),
+}
+
+impl From<io::Error> for StartError {
+    fn from(error: io::Error) -> Self {
+        Self::Io(error)
+    }
+}
+
+fn now() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |time| time.as_secs())
+}
+
+impl Images {
+    /// Takes the data folder, removes the remains of what was not finished, and opens every image that is there.
+    pub(super) fn start(config: &Config) -> Result<Self, StartError> {
+        let lock =
+            File::options().read(true).write(true).create(true).truncate(false).open(config.data_dir.join(LOCK))?;
+        match lock.try_lock() {
+            Err(fs::TryLockError::WouldBlock) => return Err(StartError::InUse),
+            Err(fs::TryLockError::Error(error)) => return Err(error.into()),
+            Ok(()) => {}
+        }
+        let folder = config.data_dir.join(IMAGES);
+        fs::create_dir_all(&folder)?;
+        let images = Self {
+            all: Mutex::default(),
+            folder,
+            limit: config.images,
+            disk: config.disk.0,
+            leaving: AtomicU64::new(0),
+            ttl: config.image_ttl,
+            _lock: lock,
+        };
+        for found in fs::read_dir(&images.folder)? {
+            let (name, path) = found.map(|found| (found.file_name(), found.path()))?;
+            match name.to_str().and_then(Id::chosen) {
+                Some(id) => images.recover(id, &path)?,
+                // An image that was just being made, or removed.
+                None => remove(&path)?,
+            }
+        }
+        Ok(images)
+    }
+
+    fn recover(&self, id: Id, path: &Path) -> io::Result<()> {
+        for found in fs::read_dir(path)? {
+            let found = found?;
+            if found.file_name().to_str().is_none_or(|name| !image::FILES.contains(&name)) {
+                remove(&found.path())?;
+            }
+        }
+        let touched =
+            fs::metadata(path.join(image::TOUCHED)).or_else(|_| fs::metadata(path)).and_then(|m| m.modified());
+        let touched =
+            touched.ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok()).map_or_else(now, |t| t.as_secs());
+        let (disk, slot) = match Image::open(Box::new(Directory::new(path))) {
+            Ok(image) => {
+                let (disk, summary) = (image.description().disk, super::images::summary(&id, &image));
+                // What can go on is kept open.
+                let waits = image.read().regions().is_some_and(|regions| regions.open() > 0);
+                (disk, if waits { Slot::Open(Arc::new(image)) } else { Slot::Closed(summary) })
+            }
+            Err(error) => {
+                tracing::error!(id = id.0, %error, "an image cannot be opened");
+                (
+                    used(path),
+                    if error.is_damage() { Slot::Damaged(error.to_string()) } else { Slot::Closed(Value::Null) },
+                )
+            }
+        };
+        self.lock().insert(id.clone(), Arc::new(Entry::new(id, disk, touched, slot)));
+        Ok(())
+    }
+
+    /// Goes on with what can be filtered. To be called once, in a runtime.
+    pub(super) fn resume(&self, service: &Shared) {
+        for entry in self.entries() {
+            let Slot::Open(image) = &*entry.slot() else { continue };
+            regions::kick(service, &Opened { entry: Arc::clone(&entry), image: Arc::clone(image) });
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<Id, Arc<Entry>>> {
+        self.all.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// How many there are.
+    pub(super) fn count(&self) -> usize {
+        self.lock().len()
+    }
+
+    pub(super) fn entries(&self) -> Vec<Arc<Entry>> {
+        self.lock().values().cloned().collect()
+    }
+
+    /// Seconds since 1970 at which an image will be forgotten, if nobody uses it.
+    pub(super) fn expires(&self, entry: &Entry) -> u64 {
+        entry.touched().saturating_add(self.ttl.as_secs())
+    }
+
+    /// The image of this id, in memory. Blocks.
+    pub(super) fn find(&self, id: &Id) -> Result<Opened, Refusal> {
+        let entry = self.lock().get(id).cloned().ok_or_else(|| no_image(&id.0))?;
+        let image = self.load(&entry)?.ok_or_else(|| no_image(&id.0))?;
+        self.touch(&entry);
+        Ok(Opened { entry, image })
+    }
+
+    /// An entry's image, from the disk if it is not in memory or has failed; none if it is gone.
+    fn load(&self, entry: &Entry) -> Result<Option<Arc<Image>>, Refusal> {
+        let mut slot = entry.slot();
+        match &*slot {
+            Slot::Open(image) if image.failed().is_none() => return Ok(Some(Arc::clone(image))),
+            Slot::Open(image) => image.close(),
+            Slot::Closed(_) => {}
+            Slot::Damaged(why) => return Err(super::problem::storage("damaged", why).into()),
+            Slot::Gone => return Ok(None),
+        }
+        match Image::open(Box::new(Directory::new(self.folder.join(&entry.id.0)))) {
+            Ok(image) => {
+                let image = Arc::new(image);
+                *slot = Slot::Open(Arc::clone(&image));
+                Ok(Some(image))
+            }
+            Err(error) => {
+                if error.is_damage() {
+                    *slot = Slot::Damaged(error.to_string());
+                }
+                Err(error.into())
+            }
+        }
+    }
+
+    /// The image of this id, if it is still there; nobody has asked for it. Blocks.
+    pub(super) fn again(&self, id: &Id) -> Result<Option<Opened>, Refusal> {
+        let Some(entry) = self.lock().get(id).cloned() else { return Ok(None) };
+        Ok(self.load(&entry)?.map(|image| Opened { entry, image }))
+    }
+
+    fn touch(&self, entry: &Entry) {
+        let now = now();
+        entry.touched.store(now, Ordering::Relaxed);
+        if now.saturating_sub(entry.written.load(Ordering::Relaxed)) >= TOUCH.as_secs() {
+            entry.written.store(now, Ordering::Relaxed);
+            self.write_touched(entry);
+        }
+    }
+
+    fn write_touched(&self, entry: &Entry) {
+        let path = self.folder.join(&entry.id.0).join(image::TOUCHED);
+        let file = File::options().write(true).create(true).truncate(true).open(path);
+        // If that is not possible the image expires too early, after a new start: nothing to refuse a request for.
+        let _ = file.and_then(|file| file.set_modified(UNIX_EPOCH + Duration::from_secs(entry.touched())));
+    }
+
+    /// Opens an image, unless there is one with its id: says whether it is new, and gives the one that is there now.
+    /// Blocks.
+    pub(super) fn open(&self, id: Id, description: Description) -> Result<(bool, Opened), Refusal> {
+        let entry = Arc::new(Entry::new(id.clone(), description.disk, now(), Slot::Gone));
+        // Whoever finds the entry waits until the image is there.
+        let mut slot = entry.slot();
+        loop {
+            let known = self.lock().contains_key(&id);
+            if known {
+                match self.find(&id) {
+                    Ok(opened) if opened.image.description().same(&description) => return Ok((false, opened)),
+                    Ok(_) => {
+                        return Err(Refusal::new(
+                            StatusCode::CONFLICT,
+                            "image_conflict",
+                            "The image is there, opened differently",
+                            format!(
+                                "image {:?} was opened with another size, preset, seed, parameters, halo, samples or \
+                                 channels",
+                                id.0
+                            ),
+                        ));
+                    }
+                    // It has gone just now.
+                    Err(refusal) if refusal.0.code == "unknown_image" => continue,
+                    Err(refusal) => return Err(refusal),
+                }
+            }
+            let mut all = self.lock();
+            if all.contains_key(&id) {
+                continue;
+            }
+            self.admit(&all, description.disk)?;
+            all.insert(id.clone(), Arc::clone(&entry));
+            break;
+        }
+        let made = self.create(&id, &description);
+        match made {
+            Ok(image) => {
+                let image = Arc::new(image);
+                *slot = Slot::Open(Arc::clone(&image));
+                drop(slot);
+                Ok((true, Opened { entry, image }))
+            }
+            Err(error) => {
+                drop(slot);
+                self.lock().remove(&id);
+                Err(error.into())
+            }
+        }
+    }
+
+    /// Refuses one image more than there may be, or one that takes more disk than is left.
+    fn admit(&self, all: &BTreeMap<Id, Arc<Entry>>, needed: u64) -> Result<(), Refusal> {
+        if all.len() >= self.limit {
+            return Err(Problem::new(
+                503,
+                "too_many_images",
+                "Too many images are open",
+                format!("{} images are open; delete some that are done", self.limit),
+            )
+            .with("retry_after", 60)
+            .into());
+        }
+        let taken = all.values().map(|entry| entry.disk).sum::<u64>() + self.leaving.load(Ordering::Relaxed);
+        let free = self.disk.saturating_sub(taken);
+        if needed > free {
+            let detail = format!(
+                "the image may take {needed} bytes of disk, and of the {} bytes for all images {free} are free",
+                self.disk
+            );
+            return Err(Problem::new(507, "disk_quota", "The disk quota is used up", detail)
+                .with("needed", needed)
+                .with("free", free)
+                .with("quota", self.disk)
+                .into());
+        }
+        Ok(())
+    }
+
+    fn create(&self, id: &Id, description: &Description) -> Result<Image, ImageError> {
+        let (new, path) = (self.folder.join(format!(".new-{}", id.0)), self.folder.join(&id.0));
+        remove(&new)?;
+        fs::create_dir(&new)?;
+        let made = Image::create(&Directory::new(&new), description)
+            .and_then(|()| Ok(fs::rename(&new, &path)?))
+            .and_then(|()| Ok(File::open(&self.folder)?.sync_all()?))
+            .and_then(|()| Image::open(Box::new(Directory::new(&path))));
+        if made.is_err() {
+            // At the next start at the latest.
+            let _ = remove(&new).and_then(|()| remove(&path));
+        }
+        made
+    }
+
+    /// Forgets an image. Says whether there was one. Blocks.
+    pub(super) fn delete(&self, id: &Id) -> Result<bool, Refusal> {
+        let Some(entry) = self.lock().get(id).cloned() else { return Ok(false) };
+        let mut slot = entry.slot();
+        if let Slot::Open(image) = &*slot {
+            image.stop();
+        }
+        if matches!(*slot, Slot::Gone) {
+            return Ok(false);
+        }
+        let gone = self.folder.join(format!(".gone-{}", Id::new().0));
+        fs::rename(self.folder.join(&id.0), &gone)?;
+        *slot = Slot::Gone;
+        self.leaving.fetch_add(entry.disk, Ordering::Relaxed);
+        self.lock().remove(id);
+        drop(slot);
+        let removed = File::open(&self.folder).and_then(|folder| folder.sync_all()).and_then(|()| remove(&gone));
+        self.leaving.fetch_sub(entry.disk, Ordering::Relaxed);
+        removed?;
+        Ok(true)
+    }
+
+    /// Forgets images that nobody has used for long, and closes those that nobody uses. Blocks.
+    pub(super) fn tidy(&self) {
+        let now = now();
+        for entry in self.entries() {
+            if now >= self.expires(&entry) {
+                match self.delete(&entry.id) {
+                    Ok(_) => tracing::info!(id = entry.id.0, "image expired"),
+                    Err(refusal) => {
+                        tracing::warn!(id = entry.id.0, problem = refusal.0.detail, "cannot forget an image")
+                    }
+                }
+            } else if now.saturating_sub(entry.touched()) >= LINGER.as_secs() {
+                entry.close();
+            }
+        }
+    }
+
+    /// Stops the work on all images. Blocks.
+    pub(super) fn stop(&self) {
+        for entry in self.entries() {
+            if let Slot::Open(image) = &*entry.slot() {
+                image.stop();
+            }
+        }
+    }
+
+    /// The summaries of all images. Blocks.
+    pub(super) fn list(&self) -> Vec<Value> {
+        let one = |entry: &Arc<Entry>| {
+            let mut summary = match &*entry.slot() {
+                Slot::Open(image) => super::images::summary(&entry.id, image),
+                Slot::Closed(summary) if summary.is_object() => summary.clone(),
+                Slot::Closed(_) => json!({ "id": entry.id.0 }),
+                Slot::Damaged(why) => json!({ "id": entry.id.0, "damaged": why }),
+                Slot::Gone => return None,
+            };
+            summary["expires"] = self.expires(entry).into();
+            Some(summary)
+        };
+        self.entries().iter().filter_map(one).collect()
+    }
+}
+
+impl Entry {
+    /// Closes the image if nobody uses it.
+    fn close(&self) {
+        let mut slot = self.slot();
+        let Slot::Open(image) = &*slot else { return };
+        // Nobody else can get hold of it meanwhile.
+        if Arc::strong_count(image) > 1 || image.failed().is_some() || !image.read().idle() {
+            return;
+        }
+        let summary = super::images::summary(&self.id, image);
+        image.close();
+        *slot = Slot::Closed(summary);
+    }
+}
+
+fn remove(path: &Path) -> io::Result<()> {
+    let removed = match fs::symlink_metadata(path) {
+        Ok(found) if found.is_dir() => fs::remove_dir_all(path),
+        Ok(_) => fs::remove_file(path),
+        Err(error) => Err(error),
+    };
+    match removed {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// Bytes of disk that the files of a folder take.
+fn used(path: &Path) -> u64 {
+    use std::os::unix::fs::MetadataExt;
+    let files = fs::read_dir(path).into_iter().flatten().flatten();
+    files.filter_map(|file| Some(file.metadata().ok()?.blocks() * 512)).sum()
+}

@@ -1,0 +1,422 @@
+//! Samples of an image, core by core, in a file that stays: compressed, found by [`Extent`]s, given back when they are
+//! not needed any more.
+//!
+//! A core's samples are a *head* and *blocks*. A block is up to 65536 values of one plane (f32; or, of the counts, u16),
+//! their bytes ordered by significance, as one zstd frame with a checksum. The head says which planes are constant and
+//! how long each block is; its hash is in the extent. So whatever is read back is what was written, or an error.
+
+use std::{cell::RefCell, io, path::PathBuf, sync::Arc};
+
+use super::{
+    SpoolError,
+    cut::{Part, cut},
+};
+use crate::{
+    disk::{Folder, Storage},
+    filter::{ChannelSet, Plane, Rect, SampleTile, TileGeometry},
+};
+
+/// Name of the file in its folder.
+pub const SAMPLES_FILE: &str = "samples";
+/// Values of a block.
+const BLOCK: u64 = 1 << 16;
+/// Favour speed: noise does not compress well anyway.
+const LEVEL: i32 = 1;
+/// File systems give back whole pages only.
+const PAGE: u64 = 4096;
+/// Memory that writing or reading a core takes at most beside the samples: a few blocks, and what zstd needs.
+pub const BUFFERS: u64 = 4 << 20;
+
+/// Where the samples of a core are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Extent {
+    /// First byte in the file.
+    pub offset: u64,
+    /// Bytes, head included.
+    pub len: u64,
+    /// Bytes of the head.
+    pub head: u32,
+    /// Hash of the head.
+    pub check: [u8; 16],
+}
+
+/// Bytes of disk that the samples of `cores` cores take at most, which have so many pixels and samples in all.
+pub fn worst_case(cores: u64, pixels: u64, samples: u64, planes: usize, varying: bool) -> u64 {
+    // A frame is at most a 256th longer than what is in it, and a few bytes; its length is in the head.
+    let stored = |bytes: u64, values: u64| bytes + bytes / 256 + (80 + 4) * values.div_ceil(BLOCK);
+    let counts = if varying { stored(2 * pixels, pixels) } else { 0 };
+    // Each core may begin a block and a page.
+    let per_core = PAGE + 5 + (planes as u64 + 1) * (80 + 4 + 5);
+    counts + stored(4 * samples, samples) * planes as u64 + cores * per_core
+}
+
+/// The file.
+#[derive(Debug)]
+pub struct SampleFile {
+    file: Arc<dyn Storage>,
+    path: PathBuf,
+    channels: ChannelSet,
+    /// Where the next core may go.
+    end: std::sync::Mutex<u64>,
+}
+
+impl SampleFile {
+    /// A new file in this folder, for samples with these channels.
+    pub fn create(folder: &dyn Folder, channels: ChannelSet) -> io::Result<Self> {
+        let path = folder.path().join(SAMPLES_FILE);
+        let file = folder.create(SAMPLES_FILE).map_err(|error| named(&path, error))?;
+        Ok(Self { file, path, channels, end: 0.into() })
+    }
+
+    /// A file that was made before. What is in none of these extents is given back.
+    pub fn open(folder: &dyn Folder, channels: ChannelSet, mut extents: Vec<Extent>) -> io::Result<Self> {
+        let path = folder.path().join(SAMPLES_FILE);
+        let file = folder.open(SAMPLES_FILE).map_err(|error| named(&path, error))?;
+        extents.sort_unstable_by_key(|extent| extent.offset);
+        let mut end = 0u64;
+        for extent in &extents {
+            let start = extent.offset / PAGE * PAGE;
+            if start > end {
+                file.release(end, start - end);
+            }
+            end = (extent.offset + extent.len).next_multiple_of(PAGE);
+        }
+        let len = file.len().map_err(|error| named(&path, error))?;
+        let needed = extents.last().map_or(0, |extent| extent.offset + extent.len);
+        if len < needed {
+            let why = format!("it has {len} bytes, but {needed} were written");
+            return Err(named(&path, io::Error::new(io::ErrorKind::InvalidData, why)));
+        }
+        file.set_len(needed).map_err(|error| named(&path, error))?;
+        Ok(Self { file, path, channels, end: end.into() })
+    }
+
+    /// Writes the samples of a tile's core. They are durable after [`Self::sync`].
+    pub fn append(&self, tile: &SampleTile) -> io::Result<Extent> {
+        let core = tile.geometry().core();
+        let window = tile.geometry().window();
+        let rows = || (core.y..core.bottom()).map(|y| (window.index(core.x, y), window.index(core.right() - 1, y)));
+        let samples: u64 = rows().map(|(a, b)| (tile.samples_of(b).end - tile.samples_of(a).start) as u64).sum();
+        let room = worst_case(1, core.area(), samples, self.channels.planes(), tile.varying());
+        let room = room.next_multiple_of(PAGE);
+        let offset = {
+            let mut end = self.end.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+            *end += room;
+            *end - room
+        };
+        let written = self.write_core(tile, offset, samples);
+        written.map_err(|error| {
+            self.file.release(offset, room);
+            named(&self.path, error)
+        })
+    }
+
+    fn write_core(&self, tile: &SampleTile, offset: u64, samples: u64) -> io::Result<Extent> {
+        let (core, window) = (tile.geometry().core(), tile.geometry().window());
+        let pixels = |y| window.index(core.x, y)..window.index(core.x, y) + core.width as usize;
+        let tables: u64 = (0..self.channels.planes())
+            .map(|plane| match tile.plane(plane) {
+                Plane::Constant(_) => 5,
+                Plane::Values(_) => 1 + 4 * samples.div_ceil(BLOCK),
+            })
+            .sum();
+        let counts = if tile.varying() { 4 * core.area().div_ceil(BLOCK) } else { 0 };
+        let mut head = Vec::with_capacity((5 + counts + tables) as usize);
+        let mut out = BlockWriter::new(&*self.file, offset + 5 + counts + tables)?;
+        if tile.varying() {
+            head.push(1);
+            head.extend_from_slice(&[0; 4]);
+            for y in core.y..core.bottom() {
+                pixels(y).try_for_each(|p| out.push(&(tile.samples_of(p).len() as u16).to_le_bytes(), &mut head))?;
+            }
+            out.end(&mut head)?;
+        } else {
+            head.push(0);
+            head.extend_from_slice(&tile.max_per_pixel().to_le_bytes());
+        }
+        for plane in 0..self.channels.planes() {
+            match tile.plane(plane) {
+                Plane::Constant(value) => {
+                    head.push(0);
+                    head.extend_from_slice(&value.to_le_bytes());
+                }
+                Plane::Values(values) => {
+                    head.push(1);
+                    for y in core.y..core.bottom() {
+                        let row = pixels(y);
+                        let row = tile.samples_of(row.start).start..tile.samples_of(row.end - 1).end;
+                        values[row].iter().try_for_each(|value| out.push(&value.to_le_bytes(), &mut head))?;
+                    }
+                    out.end(&mut head)?;
+                }
+            }
+        }
+        self.file.write(offset, &head)?;
+        let len = out.at - offset;
+        Ok(Extent { offset, len, head: head.len() as u32, check: hash(&head) })
+    }
+
+    /// Waits until all that was appended is on the disk.
+    pub fn sync(&self) -> io::Result<()> {
+        self.file.sync().map_err(|error| named(&self.path, error))
+    }
+
+    /// Gives the space of a core back.
+    pub fn release(&self, extent: &Extent) {
+        let (start, end) = (extent.offset.next_multiple_of(PAGE), (extent.offset + extent.len).next_multiple_of(PAGE));
+        self.file.release(start, end.saturating_sub(start));
+    }
+
+    /// A tile of this geometry, from the cores that have pixels in its window; pixels of none of them are pixels without
+    /// samples.
+    pub fn cut(&self, geometry: TileGeometry, cores: &[(Rect, Extent)]) -> Result<SampleTile, SpoolError> {
+        let reader = Reader { file: &*self.file, cache: RefCell::default() };
+        let parts = cores.iter().map(|(core, extent)| {
+            let part = StoredPart::open(&reader, *core, extent, self.channels.planes());
+            Ok((*core, part.map_err(|error| named(&self.path, error))?))
+        });
+        let parts = parts.collect::<io::Result<Vec<_>>>()?;
+        cut(geometry, &self.channels, &parts).map_err(|error| match error {
+            SpoolError::Io(error) => named(&self.path, error).into(),
+            error => error,
+        })
+    }
+
+    /// Memory that [`Self::cut`] takes at most beside the tile itself.
+    pub fn cut_bytes(&self, cores: &[(Rect, Extent)]) -> u64 {
+        let per_part = 256 + 64 * self.channels.planes() as u64;
+        BUFFERS
+            + cores
+                .iter()
+                .map(|(core, extent)| per_part + 3 * u64::from(extent.head) + 8 * u64::from(core.height))
+                .sum::<u64>()
+    }
+}
+
+/// An error that names its file.
+fn named(path: &std::path::Path, error: io::Error) -> io::Error {
+    let why = format!("{}: {error}", path.display());
+    if error.kind() == io::ErrorKind::UnexpectedEof {
+        return io::Error::new(io::ErrorKind::InvalidData, why);
+    }
+    io::Error::new(error.kind(), why)
+}
+
+fn hash(bytes: &[u8]) -> [u8; 16] {
+    let mut short = [0; 16];
+    short.copy_from_slice(&blake3::hash(bytes).as_bytes()[..16]);
+    short
+}
+
+/// Collects values of one size, and writes blocks of them.
+struct BlockWriter<'a> {
+    file: &'a dyn Storage,
+    at: u64,
+    /// Values, as they come.
+    values: Vec<u8>,
+    /// The same, by significance, and compressed.
+    ordered: Vec<u8>,
+    compressed: Vec<u8>,
+    /// Bytes of a value.
+    size: usize,
+    compressor: zstd::bulk::Compressor<'static>,
+}
+
+impl<'a> BlockWriter<'a> {
+    fn new(file: &'a dyn Storage, at: u64) -> io::Result<Self> {
+        let mut compressor = zstd::bulk::Compressor::new(LEVEL)?;
+        compressor.include_checksum(true)?;
+        Ok(Self { file, at, values: Vec::new(), ordered: Vec::new(), compressed: Vec::new(), size: 1, compressor })
+    }
+
+    fn push(&mut self, value: &[u8], head: &mut Vec<u8>) -> io::Result<()> {
+        self.size = value.len();
+        self.values.extend_from_slice(value);
+        if self.values.len() as u64 == BLOCK * value.len() as u64 { self.end(head) } else { Ok(()) }
+    }
+
+    /// Writes what there is as a block.
+    fn end(&mut self, head: &mut Vec<u8>) -> io::Result<()> {
+        if self.values.is_empty() {
+            return Ok(());
+        }
+        self.ordered.clear();
+        for byte in 0..self.size {
+            self.ordered.extend(self.values.iter().skip(byte).step_by(self.size));
+        }
+        self.compressed.clear();
+        self.compressed.reserve(zstd::zstd_safe::compress_bound(self.ordered.len()));
+        self.compressor.compress_to_buffer(&self.ordered, &mut self.compressed)?;
+        self.file.write(self.at, &self.compressed)?;
+        head.extend_from_slice(&(self.compressed.len() as u32).to_le_bytes());
+        self.at += self.compressed.len() as u64;
+        self.values.clear();
+        Ok(())
+    }
+}
+
+/// Reads blocks, and keeps the last.
+struct Reader<'a> {
+    file: &'a dyn Storage,
+    cache: RefCell<Cache>,
+}
+
+#[derive(Default)]
+struct Cache {
+    /// Where the block is, of which these are the values by significance.
+    block: Option<u64>,
+    bytes: Vec<u8>,
+}
+
+/// Blocks of a plane, or of the counts.
+#[derive(Debug, Default)]
+struct Blocks {
+    /// Where each starts, and the end of the last.
+    starts: Vec<u64>,
+    values: u64,
+}
+
+impl Reader<'_> {
+    /// Reads values of `N` bytes from this one on.
+    fn read<const N: usize>(
+        &self,
+        blocks: &Blocks,
+        from: u64,
+        count: u64,
+        mut put: impl FnMut([u8; N]),
+    ) -> io::Result<()> {
+        let invalid = |why: &str| io::Error::new(io::ErrorKind::InvalidData, format!("it is damaged: {why}"));
+        let (mut at, end) = (from, from + count);
+        if end > blocks.values {
+            return Err(invalid("a core has fewer samples than it should"));
+        }
+        let mut cache = self.cache.borrow_mut();
+        while at < end {
+            let index = (at / BLOCK) as usize;
+            let (first, start, stop) = (index as u64 * BLOCK, blocks.starts[index], blocks.starts[index + 1]);
+            let values = (blocks.values - first).min(BLOCK) as usize;
+            if cache.block != Some(start) {
+                cache.block = None;
+                let mut compressed = vec![0; (stop - start) as usize];
+                self.file.read(start, &mut compressed)?;
+                cache.bytes =
+                    zstd::bulk::decompress(&compressed, values * N).map_err(|_| invalid("a block of samples"))?;
+                if cache.bytes.len() != values * N {
+                    return Err(invalid("a block of samples has another length"));
+                }
+                cache.block = Some(start);
+            }
+            let range = (at - first) as usize..((end - first) as usize).min(values);
+            at = first + range.end as u64;
+            range.for_each(|i| put(std::array::from_fn(|byte| cache.bytes[byte * values + i])));
+        }
+        Ok(())
+    }
+}
+
+/// A core in the file.
+struct StoredPart<'a> {
+    reader: &'a Reader<'a>,
+    uniform: Option<u32>,
+    counts: Blocks,
+    /// With varying samples those ahead of each row, and all of them.
+    rows: Vec<u64>,
+    planes: Vec<Result<Blocks, f32>>,
+}
+
+impl<'a> StoredPart<'a> {
+    fn open(reader: &'a Reader<'a>, core: Rect, extent: &Extent, planes: usize) -> io::Result<Self> {
+        let invalid = || io::Error::new(io::ErrorKind::InvalidData, format!("it is damaged: the head of tile {core}"));
+        let mut bytes = vec![0; extent.head as usize];
+        reader.file.read(extent.offset, &mut bytes)?;
+        if hash(&bytes) != extent.check {
+            return Err(invalid());
+        }
+        let (mut head, mut at) = (&bytes[..], extent.offset + u64::from(extent.head));
+        let mut part = Self { reader, uniform: None, counts: Blocks::default(), rows: Vec::new(), planes: Vec::new() };
+        let mut samples = 0;
+        match (byte(&mut head), number(&mut head)) {
+            (Some(0), Some(n)) => {
+                part.uniform = Some(n);
+                samples += core.area() * u64::from(n);
+            }
+            (Some(1), Some(_)) => {
+                part.counts = blocks(&mut head, &mut at, core.area()).ok_or_else(invalid)?;
+                part.rows.push(0);
+                for row in 0..u64::from(core.height) {
+                    let width = u64::from(core.width);
+                    reader.read(&part.counts, row * width, width, |count| {
+                        samples += u64::from(u16::from_le_bytes(count));
+                    })?;
+                    part.rows.push(samples);
+                }
+            }
+            _ => return Err(invalid()),
+        }
+        for _ in 0..planes {
+            let plane = match byte(&mut head) {
+                Some(0) => Err(f32::from_bits(number(&mut head).ok_or_else(invalid)?)),
+                Some(1) => Ok(blocks(&mut head, &mut at, samples).ok_or_else(invalid)?),
+                _ => return Err(invalid()),
+            };
+            part.planes.push(plane);
+        }
+        if head.is_empty() && at == extent.offset + extent.len { Ok(part) } else { Err(invalid()) }
+    }
+}
+
+fn byte(head: &mut &[u8]) -> Option<u8> {
+    let (first, rest) = head.split_first()?;
+    *head = rest;
+    Some(*first)
+}
+
+fn number(head: &mut &[u8]) -> Option<u32> {
+    let (first, rest) = head.split_first_chunk()?;
+    *head = rest;
+    Some(u32::from_le_bytes(*first))
+}
+
+fn blocks(head: &mut &[u8], at: &mut u64, values: u64) -> Option<Blocks> {
+    let mut starts = vec![*at];
+    for _ in 0..values.div_ceil(BLOCK) {
+        *at += u64::from(number(head)?);
+        starts.push(*at);
+    }
+    Some(Blocks { starts, values })
+}
+
+impl Part for StoredPart<'_> {
+    fn uniform(&self) -> Option<u32> {
+        self.uniform
+    }
+
+    fn counts(&self, pixel: u64, into: &mut [u16]) -> io::Result<()> {
+        let count = into.len() as u64;
+        let mut slots = into.iter_mut();
+        self.reader.read(&self.counts, pixel, count, |value| {
+            if let Some(slot) = slots.next() {
+                *slot = u16::from_le_bytes(value);
+            }
+        })
+    }
+
+    fn row_start(&self, row: u32) -> io::Result<u64> {
+        Ok(self.rows[row as usize])
+    }
+
+    fn constant(&self, plane: usize) -> Option<f32> {
+        self.planes[plane].as_ref().err().copied()
+    }
+
+    fn values(&self, plane: usize, sample: u64, into: &mut [f32]) -> io::Result<()> {
+        let Ok(blocks) = &self.planes[plane] else { return Ok(()) };
+        let count = into.len() as u64;
+        let mut slots = into.iter_mut();
+        self.reader.read(blocks, sample, count, |value| {
+            if let Some(slot) = slots.next() {
+                *slot = f32::from_le_bytes(value);
+            }
+        })
+    }
+}

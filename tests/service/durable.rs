@@ -1,0 +1,188 @@
+//! What an image has survives: kills, new starts, damaged files, a full disk. Images end when nobody uses them.
+
+use super::{Server, encode, neighbors, samples, tile, wait_for};
+use rpfd::filter::Rect;
+use serde_json::json;
+use std::process::Command;
+
+const SIZE: [u32; 2] = [32, 16];
+const LEFT: Rect = Rect::new(0, 0, 16, 16);
+const RIGHT: Rect = Rect::new(16, 0, 16, 16);
+
+fn open(server: &Server, id: &str) {
+    let body = format!(r#"{{"width": 32, "height": 16, "id": "{id}", "seed": 3}}"#);
+    let status = server.post("/v1/images", body.as_bytes()).status;
+    assert!([200, 201].contains(&status));
+}
+
+fn send(server: &Server, id: &str, core: Rect) -> String {
+    let lines = server.post(&format!("/v1/images/{id}/tiles"), &tile(SIZE, core, 17)).lines();
+    lines[0]["state"].as_str().unwrap().to_owned()
+}
+
+#[test]
+fn images_are_there_after_a_stop_and_after_a_kill() {
+    let server = Server::start(&[]);
+    open(&server, "a");
+    open(&server, "b");
+    assert_eq!(send(&server, "a", LEFT), "filtered");
+    let before = server.get("/v1/images/a").json();
+    let partial = server.get("/v1/images/a/result.exr?partial=true").body;
+    let (status, folder) = server.terminated();
+    assert!(status.success());
+    let mut server = Server::start_in(folder, &[]);
+    for _ in 0..2 {
+        let mut after = server.get("/v1/images/a").json();
+        after["expires"] = before["expires"].clone();
+        assert_eq!(after, before);
+        assert!(server.get("/v1/images/a/result.exr?partial=true").body == partial);
+        assert_eq!(send(&server, "a", LEFT), "repeated");
+        let images = server.get("/v1/images").json();
+        assert_eq!(images["images"].as_array().unwrap().len(), 2);
+        server = Server::start_in(server.kill(), &[]);
+    }
+    // Another tile's channels are still refused, and the same opening is still the same.
+    open(&server, "a");
+    assert_eq!(send(&server, "a", RIGHT), "filtered");
+    let exr = server.get("/v1/images/a/result.exr").body;
+    assert_eq!((send(&server, "b", RIGHT), send(&server, "b", LEFT)), ("filtered".into(), "filtered".into()));
+    assert!(server.get("/v1/images/b/result.exr").body == exr);
+    // What was deleted stays so.
+    assert_eq!(server.call("DELETE", "/v1/images/b", &[], &[]).status, 204);
+    let server = Server::start_in(server.kill(), &[]);
+    server.get("/v1/images/b").problem(404, "unknown_image");
+    assert_eq!(server.get("/v1/images/a/result.exr").body, exr);
+}
+
+#[test]
+fn a_replaced_tile_is_the_new_one_after_a_kill() {
+    let server = Server::start(&[]);
+    open(&server, "a");
+    send(&server, "a", LEFT);
+    let old = server.get("/v1/images/a/result.exr?partial=true").body;
+    let other = encode(&samples(SIZE, LEFT, 17, 2));
+    assert_eq!(server.post("/v1/images/a/tiles?replace=true", &other).lines()[0]["state"], "filtered");
+    let new = server.get("/v1/images/a/result.exr?partial=true").body;
+    assert_ne!(old, new);
+    let server = Server::start_in(server.kill(), &[]);
+    assert_eq!(server.get("/v1/images/a/result.exr?partial=true").body, new);
+    assert_eq!(server.post("/v1/images/a/tiles", &other).lines()[0]["state"], "repeated");
+}
+
+#[test]
+fn remains_are_removed_and_a_folder_has_one_service() {
+    let server = Server::start(&[]);
+    open(&server, "a");
+    let images = server.data_dir().join("images");
+    let second = Command::new(env!("CARGO_BIN_EXE_rpfd"))
+        .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
+        .arg(server.data_dir())
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&second.stderr);
+    assert!(second.status.code() == Some(1) && said.contains("in use by another service"), "{said}");
+    let folder = server.kill();
+    for name in [".new-b", ".gone-0123", "c d"] {
+        std::fs::create_dir(images.join(name)).unwrap();
+        std::fs::write(images.join(name).join("canvas"), b"some").unwrap();
+    }
+    std::fs::write(images.join("a/.tmp123"), b"half of a result").unwrap();
+    let server = Server::start_in(folder, &[]);
+    let mut names: Vec<_> =
+        std::fs::read_dir(&images).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    assert_eq!(names, ["a"]);
+    assert!(!images.join("a/.tmp123").exists());
+    assert_eq!(send(&server, "a", LEFT), "filtered");
+}
+
+#[test]
+fn a_damaged_file_is_named_and_leaves_other_images_alone() {
+    let server = Server::start(&[]);
+    for id in ["state", "short", "canvas", "fine"] {
+        open(&server, id);
+        send(&server, id, LEFT);
+        send(&server, id, RIGHT);
+    }
+    let exr = server.get("/v1/images/fine/result.exr").body;
+    // Its tiles wait for others.
+    server.post("/v1/images", &neighbors::opening("samples", [64, 64], "lean", ("samples", 4)));
+    server.post("/v1/images/samples/tiles", &tile([64, 64], Rect::new(0, 0, 32, 64), 0)).lines();
+    let folder = server.kill();
+    let path = |id: &str, file: &str| folder.path().join("images").join(id).join(file);
+    let flip = |path: &std::path::Path, at: usize| {
+        let mut bytes = std::fs::read(path).unwrap();
+        bytes[at] ^= 4;
+        std::fs::write(path, bytes).unwrap();
+    };
+    let state = path("state", "state.redb");
+    let length = std::fs::metadata(&state).unwrap().len();
+    std::fs::File::options().write(true).open(&state).unwrap().set_len(length / 3).unwrap();
+    std::fs::File::options().write(true).open(path("short", "canvas")).unwrap().set_len(100).unwrap();
+    flip(&path("canvas", "canvas"), 1234);
+    flip(&path("samples", "samples"), 5000);
+    let server = Server::start_in(folder, &[]);
+    for (id, file) in [("state", "state.redb"), ("short", "canvas")] {
+        for problem in [
+            server.get(&format!("/v1/images/{id}")).problem(500, "damaged"),
+            server.post(&format!("/v1/images/{id}/tiles"), &tile(SIZE, LEFT, 0)).problem(500, "damaged"),
+        ] {
+            assert!(problem["detail"].as_str().unwrap().contains(&format!("{id}/{file}")), "{problem}");
+        }
+    }
+    let damaged = server.get("/v1/images").json();
+    let damaged = damaged["images"].as_array().unwrap().iter().filter(|image| image["damaged"].is_string()).count();
+    assert_eq!(damaged, 2);
+    let problem = server.get("/v1/images/canvas/result.exr").problem(500, "damaged");
+    assert!(problem["detail"].as_str().unwrap().contains("canvas/canvas is damaged: the pixels of tile"), "{problem}");
+    assert!(server.get("/v1/images/fine/result.exr").body == exr);
+    // Samples are read when they are needed.
+    server.post("/v1/images/samples/tiles", &tile([64, 64], Rect::new(32, 0, 32, 64), 0)).lines();
+    wait_for("the damage to show", || server.get("/v1/images/samples").json()["trouble"]["code"] == "damaged");
+    let status = server.get("/v1/images/samples").json();
+    assert!(status["trouble"]["detail"].as_str().unwrap().contains("samples/samples"), "{}", status["trouble"]);
+    for id in ["state", "short", "canvas", "samples"] {
+        assert_eq!(server.call("DELETE", &format!("/v1/images/{id}"), &[], &[]).status, 204);
+    }
+    open(&server, "state");
+    assert_eq!(send(&server, "state", LEFT), "filtered");
+}
+
+#[test]
+fn images_that_nobody_uses_expire() {
+    let server = Server::start(&["--image-ttl", "1"]);
+    open(&server, "a");
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap().as_secs();
+    let expires = server.get("/v1/images/a").json()["expires"].as_u64().unwrap();
+    assert!(expires > now && expires <= now + 60, "{expires} {now}");
+    // The list is no use of them.
+    wait_for("the image to expire", || server.get("/v1/images").json()["images"] == json!([]));
+    server.get("/v1/images/a").problem(404, "unknown_image");
+    assert_eq!(std::fs::read_dir(server.data_dir().join("images")).unwrap().count(), 0);
+}
+
+#[test]
+fn a_full_quota_refuses_images_and_never_tiles() {
+    let server = Server::start(&[]);
+    open(&server, "a");
+    let bytes = server.get("/v1/images/a").json()["disk"].as_u64().unwrap();
+    drop(server);
+    let server = Server::start(&["--disk", &(2 * bytes).to_string()]);
+    open(&server, "a");
+    open(&server, "b");
+    let problem = server.post("/v1/images", br#"{"width": 32, "height": 16, "id": "c"}"#).problem(507, "disk_quota");
+    assert_eq!((&problem["needed"], &problem["free"]), (&json!(bytes), &json!(0)));
+    let problem = server
+        .post("/v1/images", &neighbors::opening("d", [4096, 4096], "lean", ("samples", 64)))
+        .problem(507, "disk_quota");
+    assert!(problem["needed"].as_u64().unwrap() > 4096 * 4096 * 64 * 27 * 4);
+    for id in ["a", "b"] {
+        assert_eq!((send(&server, id, LEFT), send(&server, id, RIGHT)), ("filtered".into(), "filtered".into()));
+        assert_eq!(server.get(&format!("/v1/images/{id}/result.exr")).status, 200);
+    }
+    // What is set aside is known again after a new start, and free again after the image.
+    let server = Server::start_in(server.kill(), &["--disk", &(2 * bytes).to_string()]);
+    server.post("/v1/images", br#"{"width": 32, "height": 16, "id": "c"}"#).problem(507, "disk_quota");
+    assert_eq!(server.call("DELETE", "/v1/images/a", &[], &[]).status, 204);
+    open(&server, "c");
+}

@@ -1,0 +1,246 @@
+//! Images whose tiles come as bare cores, and lend each other their halos.
+
+use super::{Server, encode, exact::whole_exr, samples, tile, wait_for};
+use crate::stitch::shuffle;
+use rpfd::{
+    filter::{Execution, Method, Rect, SampleTile, TileGeometry, filter, geometry::tiling},
+    image::description::channels_to_json,
+    stitch::exr,
+    store::Spool,
+    synth::Scene,
+    wire::{Decoder, Event},
+};
+use serde_json::{Value, json};
+
+/// What opens an image of this scene's tiles.
+pub(crate) fn opening(id: &str, size: [u32; 2], preset: &str, samples: (&str, u32)) -> Vec<u8> {
+    let tile = super::samples([16, 16], Rect::new(0, 0, 16, 16), 0, 1);
+    let mut opening = json!({
+        "id": id, "width": size[0], "height": size[1], "preset": preset, "seed": 5,
+        "halo": "neighbors", "channels": channels_to_json(tile.channels()),
+    });
+    opening[samples.0] = samples.1.into();
+    opening.to_string().into_bytes()
+}
+
+fn open(server: &Server, size: [u32; 2], preset: &str) {
+    let answer = server.post("/v1/images", &opening("a", size, preset, ("samples", 4)));
+    assert_eq!(answer.status, 201, "{}", String::from_utf8_lossy(&answer.body));
+}
+
+pub(crate) fn wait_complete(server: &Server, id: &str) {
+    wait_for("an image to be complete", || server.get(&format!("/v1/images/{id}")).json()["complete"] == true);
+}
+
+fn states(lines: &[Value]) -> Vec<&str> {
+    lines.iter().map(|line| line["state"].as_str().unwrap()).collect()
+}
+
+#[test]
+fn bare_cores_in_any_order_are_the_whole_image() {
+    const SIZE: [u32; 2] = [150, 130];
+    let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
+    for (preset, side) in [("lean", 33), ("cross-bilateral", 16), ("unfiltered", 150)] {
+        let server = Server::start(&["--memory", "64MiB"]);
+        open(&server, SIZE, preset);
+        let mut cores: Vec<Rect> = tiling(SIZE, side).collect();
+        shuffle(&mut cores, u64::from(side));
+        // Some bring a halo nobody needs.
+        let halo = |i: usize| if i.is_multiple_of(3) { 3 } else { 0 };
+        let bodies: Vec<Vec<u8>> = cores.iter().enumerate().map(|(i, &core)| tile(SIZE, core, halo(i))).collect();
+        let (one, others) = bodies.split_at(bodies.len() / 2);
+        std::thread::scope(|scope| {
+            for part in [one, others].into_iter().filter(|part| !part.is_empty()) {
+                let server = &server;
+                scope.spawn(move || {
+                    let lines = server.post("/v1/images/a/tiles", &part.concat()).lines();
+                    assert!(lines[..part.len()].iter().all(|line| line["state"] == "stored"), "{lines:?}");
+                });
+            }
+        });
+        wait_complete(&server, "a");
+        let status = server.get("/v1/images/a").json();
+        assert_eq!((&status["halo"], &status["tiles_stored"]), (&json!("neighbors"), &json!(cores.len())));
+        assert_eq!((&status["regions_open"], &status["waiting"]), (&json!(0), &json!([])));
+        assert_eq!(status["totals"]["short_of_halo"], 0);
+        assert_eq!(status["totals"]["samples"], 4 * SIZE[0] * SIZE[1]);
+        let exr = server.get("/v1/images/a/result.exr").body;
+        assert!(exr == whole_exr(&whole, &Method::preset(preset).unwrap(), 5), "{preset}: another image");
+        // A second time it need not be written anew, and is the same.
+        assert!(server.get("/v1/images/a/result.exr").body == exr);
+        // All samples are dropped, and known all the same.
+        let lines = server.post("/v1/images/a/tiles", &bodies[0]).lines();
+        assert_eq!(states(&lines), ["repeated", "end"]);
+        use std::os::unix::fs::MetadataExt;
+        let kept = std::fs::metadata(server.data_dir().join("images/a/samples")).unwrap();
+        assert!(kept.blocks() * 512 <= 8192, "{} bytes of samples are kept", kept.blocks() * 512);
+    }
+}
+
+#[test]
+fn numbers_of_samples_may_vary_up_to_what_was_announced() {
+    const SIZE: [u32; 2] = [80, 64];
+    let scene = Scene::by_name("all").unwrap();
+    let cut = |core| {
+        let geometry = TileGeometry::with_halo(SIZE, core, 0).unwrap();
+        scene.tile_varying(geometry, 6, &Execution { seed: 1, ..Execution::default() }).unwrap()
+    };
+    let whole = cut(Rect::new(0, 0, SIZE[0], SIZE[1]));
+    let most = whole.max_per_pixel();
+    let server = Server::start(&["--memory", "64MiB"]);
+    server.post("/v1/images", &opening("a", SIZE, "lean", ("max_samples", most)));
+    let bodies: Vec<Vec<u8>> = tiling(SIZE, 24).map(|core| encode(&cut(core))).collect();
+    let lines = server.post("/v1/images/a/tiles", &bodies.concat()).lines();
+    assert!(lines[..bodies.len()].iter().all(|line| line["state"] == "stored"), "{lines:?}");
+    wait_complete(&server, "a");
+    let exr = server.get("/v1/images/a/result.exr").body;
+    assert!(exr == whole_exr(&whole, &Method::preset("lean").unwrap(), 5));
+    // One more than was announced.
+    server.post("/v1/images", &opening("b", SIZE, "lean", ("max_samples", most - 1)));
+    let lines = server.post("/v1/images/b/tiles", &bodies.concat()).lines();
+    let refused = lines.iter().filter(|line| line["problem"]["code"] == "samples_mismatch").count();
+    assert!(refused > 0, "{lines:?}");
+    server.post("/v1/images", &opening("c", SIZE, "lean", ("samples", most)));
+    server.post("/v1/images/c/tiles", &bodies[0]).problem(422, "samples_mismatch");
+}
+
+#[test]
+fn an_image_says_which_regions_wait_for_what() {
+    const SIZE: [u32; 2] = [256, 64];
+    let server = Server::start(&[]);
+    open(&server, SIZE, "lean");
+    server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(0, 0, 64, 64), 0)).lines();
+    let status = server.get("/v1/images/a").json();
+    assert_eq!((&status["pixels_stored"], &status["regions"]), (&json!(64 * 64), &json!(4)));
+    let waiting = &status["waiting"];
+    assert_eq!(
+        waiting[0],
+        json!({"region": [0, 0, 64, 64], "state": "waiting", "for": [[64, 0, 17, 64]], "for_regions": 1})
+    );
+    assert_eq!(waiting[3]["for"], json!([[175, 0, 81, 64]]));
+    server.get("/v1/images/a/result.exr").problem(409, "image_incomplete");
+    // With its neighbour the first can be filtered, the second not.
+    server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(64, 0, 64, 64), 0)).lines();
+    wait_for("the first region", || server.get("/v1/images/a").json()["tiles_done"] == 1);
+    let status = server.get("/v1/images/a").json();
+    assert_eq!(status["tiles"][0]["tile"], json!([0, 0, 64, 64]));
+    assert_eq!(status["tiles"][0]["report"]["exact"], true);
+    assert_eq!(status["waiting"].as_array().unwrap().len(), 3);
+}
+
+#[test]
+fn what_cannot_be_is_refused() {
+    const SIZE: [u32; 2] = [70, 64];
+    let server = Server::start(&[]);
+    open(&server, SIZE, "lean");
+    let send = |body: &[u8]| server.post("/v1/images/a/tiles", body);
+    let code = |body: &[u8]| send(body).lines()[0]["problem"]["code"].as_str().unwrap().to_owned();
+    send(&tile(SIZE, Rect::new(16, 16, 15, 16), 0)).problem(422, "tile_too_small");
+    let core = Rect::new(0, 0, 32, 32);
+    assert_eq!(states(&send(&tile(SIZE, core, 0)).lines()), ["stored", "end"]);
+    assert_eq!(states(&send(&tile(SIZE, core, 7)).lines()), ["repeated", "end"]);
+    let other = encode(&samples(SIZE, core, 0, 2));
+    assert_eq!(code(&other), "tile_conflict");
+    let replace = server.post("/v1/images/a/tiles?replace=true", &other).lines();
+    assert_eq!(replace[0]["problem"]["code"], "tile_conflict");
+    assert_eq!(code(&tile(SIZE, Rect::new(16, 16, 32, 32), 0)), "tile_overlap");
+    // Only at the edge.
+    assert_eq!(states(&send(&tile(SIZE, Rect::new(64, 0, 6, 64), 0)).lines()), ["stored", "end"]);
+    // Opened differently, and wrongly.
+    let with = |change: &dyn Fn(&mut Value)| {
+        let mut opening: Value = serde_json::from_slice(&opening("a", SIZE, "lean", ("samples", 4))).unwrap();
+        change(&mut opening);
+        server.post("/v1/images", opening.to_string().as_bytes())
+    };
+    assert_eq!(with(&|_| {}).status, 200);
+    with(&|o| o["samples"] = json!(5)).problem(409, "image_conflict");
+    with(&|o| o["channels"].as_array_mut().unwrap().truncate(2)).problem(409, "image_conflict");
+    with(&|o| o["max_samples"] = json!(5)).problem(400, "bad_parameter");
+    with(&|o| o["samples"] = json!(0)).problem(400, "bad_parameter");
+    with(&|o| o["channels"] = json!([])).problem(400, "bad_parameter");
+    with(&|o| o["channels"] = json!("film")).problem(400, "bad_parameter");
+    with(&|o| o["halo"] = json!("nobody")).problem(400, "bad_parameter");
+    with(&|o| o["halo"] = json!("client")).problem(400, "bad_parameter");
+}
+
+/// The file that `rpfd filter --partial` would write of these tiles.
+fn partial(size: [u32; 2], tiles: &[SampleTile], method: &Method) -> Vec<u8> {
+    let mut spool = Spool::in_memory(1 << 26);
+    for tile in tiles {
+        let (bytes, mut decoder) = (encode(tile), Decoder::new());
+        let mut input = &bytes[..];
+        while let Some(event) = decoder.next(&mut input).unwrap() {
+            spool.push(&event).unwrap();
+            if matches!(event, Event::TileEnd) {
+                break;
+            }
+        }
+    }
+    let mut stitcher = rpfd::stitch::Stitcher::new(size[0], size[1], &std::env::temp_dir()).unwrap();
+    for tile in tiles {
+        let core = tile.geometry().core();
+        let geometry = TileGeometry::with_halo(size, core, method.reach(true)).unwrap();
+        let filtered =
+            filter(&spool.cut_partial(geometry).unwrap(), method, &Execution { seed: 5, ..Execution::default() })
+                .unwrap();
+        let rpfd::stitch::Offer::Filter(claim) = stitcher.offer(core, [0; 32], false).unwrap() else { panic!() };
+        stitcher.add(claim, &filtered).unwrap();
+    }
+    let attributes = exr::provenance(method.preset_name(), 5, method.parameters());
+    let options = rpfd::stitch::ExrOptions { attributes, ..Default::default() };
+    let mut out = std::io::Cursor::new(Vec::new());
+    stitcher.encode_exr(&options, true, &mut out).unwrap();
+    out.into_inner()
+}
+
+#[test]
+fn an_image_is_finished_with_what_there_is() {
+    const SIZE: [u32; 2] = [128, 128];
+    let there = [Rect::new(0, 0, 40, 128), Rect::new(40, 0, 88, 30), Rect::new(100, 60, 20, 20)];
+    let tiles = there.map(|core| samples(SIZE, core, 0, 1));
+    let server = Server::start(&[]);
+    open(&server, SIZE, "lean");
+    let body: Vec<u8> = tiles.iter().flat_map(encode).collect();
+    server.post("/v1/images/a/tiles", &body).lines();
+    let answer = server.post("/v1/images/a/finish", &[]);
+    assert!([200, 202].contains(&answer.status) && answer.json()["finished"] == true, "{answer:?}");
+    wait_for("the regions", || server.get("/v1/images/a").json()["regions_open"] == 0);
+    let status = server.get("/v1/images/a").json();
+    let pixels: u64 = there.iter().map(Rect::area).sum();
+    assert_eq!((&status["complete"], &status["pixels_done"]), (&json!(false), &json!(pixels)));
+    assert!(status["totals"]["short_of_halo"].as_u64().unwrap() > 0);
+    assert!(status["tiles"].as_array().unwrap().iter().any(|tile| tile["report"]["exact"] == false));
+    assert!(!status["missing"].as_array().unwrap().is_empty());
+    let exr = server.get("/v1/images/a/result.exr");
+    assert!(exr.body == partial(SIZE, &tiles, &Method::preset("lean").unwrap()), "not what filter --partial gives");
+    // It takes no more, but knows what it has.
+    let lines = server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(60, 60, 20, 20), 0)).lines();
+    assert_eq!(lines[0]["problem"]["code"], "image_finished");
+    assert_eq!(states(&server.post("/v1/images/a/tiles", &encode(&tiles[2])).lines()), ["repeated", "end"]);
+    assert_eq!(server.post("/v1/images/a/finish", &[]).status, 200);
+    // The same with tiles that bring their halos.
+    server.post("/v1/images", br#"{"width": 32, "height": 16, "id": "b"}"#);
+    let left = tile([32, 16], Rect::new(0, 0, 16, 16), 17);
+    server.post("/v1/images/b/tiles", &left).lines();
+    server.get("/v1/images/b/result.exr").problem(409, "image_incomplete");
+    assert_eq!(server.post("/v1/images/b/finish", &[]).status, 200);
+    assert_eq!(server.get("/v1/images/b/result.exr").status, 200);
+    assert_eq!(states(&server.post("/v1/images/b/tiles", &left).lines()), ["repeated", "end"]);
+    let lines = server.post("/v1/images/b/tiles", &tile([32, 16], Rect::new(16, 0, 16, 16), 0)).lines();
+    assert_eq!(lines[0]["problem"]["code"], "image_finished");
+    server.post("/v1/images/c/finish", &[]).problem(404, "unknown_image");
+}
+
+#[test]
+fn post_sends_bare_cores() {
+    let render = crate::cli::data("depth_of_field.8spp.tiles.zst");
+    let folder = crate::cli::Folder::new();
+    let (offline, posted) = (folder.path("offline.exr"), folder.path("posted.exr"));
+    let render = render.to_str().unwrap();
+    assert!(crate::cli::rpfd(["filter", render, "-o", &offline]).status.success());
+    let server = Server::start(&[]);
+    let url = format!("http://{}", server.address);
+    let output = crate::cli::rpfd(["post", render, "--to", &url, "-o", &posted, "--halo", "neighbors", "--tile", "32"]);
+    assert!(output.status.success(), "{}", crate::cli::stderr(&output));
+    assert!(std::fs::read(offline).unwrap() == std::fs::read(posted).unwrap());
+}
