@@ -78,6 +78,16 @@ pub(super) fn calls() -> Vec<Call> {
             ],
         },
         Call {
+            path: "/v1/images/{id}/finish",
+            handlers: post(images::finish),
+            operations: vec![(
+                Post,
+                of_image("finishImage", "Takes no more tiles, and filters what waits with what there is")
+                    .response("200", json("It is done", "Image"))
+                    .response("202", json("Regions are still to be filtered", "Image")),
+            )],
+        },
+        Call {
             path: "/v1/images/{id}/tiles",
             handlers: post(stream::image_tiles).put(stream::image_tiles),
             operations: both(tiles_operation, "sendTiles", "sendTilesPut"),
@@ -268,6 +278,9 @@ pub(super) fn document() -> String {
         .schema_from::<OpenImage>()
         .schema_from::<Image>()
         .schema_from::<Images>()
+        .schema_from::<ListedImage>()
+        .schema_from::<OpenChannel>()
+        .schema_from::<WaitingRegion>()
         .schema_from::<ImageStatus>()
         .schema_from::<TileStatus>()
         .schema_from::<Report>()
@@ -322,6 +335,31 @@ schemas! {
         preset: Option<String>,
         /// Keys every random draw; 0 if it is absent.
         seed: Option<u64>,
+        /// Who brings the context around tiles: `client` (also if it is absent) with each tile, or `neighbors`, the tiles
+        /// around it.
+        halo: Option<String>,
+        /// With `neighbors`: samples of each pixel; or `max_samples`.
+        samples: Option<u32>,
+        /// With `neighbors`: most samples of a pixel, if they vary.
+        max_samples: Option<u32>,
+        /// With `neighbors`: the channels of all tiles, in order.
+        channels: Option<Vec<OpenChannel>>,
+    }
+
+    /// A channel as tiles announce it (proto/tile.md).
+    struct OpenChannel {
+        /// Its name.
+        name: String,
+        /// `film`, `color`, `feature` or `random`.
+        role: String,
+        /// Values of each sample.
+        components: u32,
+        /// Of a feature: `position` or `other`.
+        #[schema(nullable = false)]
+        space: Option<String>,
+        /// Of a random parameter: whether it is uniform on [0, 1).
+        #[schema(nullable = false)]
+        uniform: Option<bool>,
     }
 
     /// An image's summary.
@@ -338,20 +376,99 @@ schemas! {
         seed: u64,
         /// Every parameter of the preset, in words.
         parameters: BTreeMap<String, String>,
-        /// Whether every pixel is stored.
+        /// `client` or `neighbors`: who brings the context around tiles.
+        halo: String,
+        /// Whether every pixel is filtered and stored.
         complete: bool,
-        /// Tiles stored.
+        /// Whether it takes no more tiles.
+        finished: bool,
+        /// Tiles filtered and stored; with `neighbors` these are regions, or parts of them.
         tiles_done: u64,
         /// Pixels of the image.
         pixels: u64,
-        /// Pixels stored.
+        /// Pixels filtered and stored.
         pixels_done: u64,
+        /// Bytes of disk that are set aside for it.
+        disk: u64,
+        /// Seconds since 1970 at which it is forgotten, if nobody uses it until then.
+        expires: u64,
+        /// With `neighbors`: cores that have come.
+        #[schema(nullable = false)]
+        tiles_stored: Option<u64>,
+        /// With `neighbors`: their pixels.
+        #[schema(nullable = false)]
+        pixels_stored: Option<u64>,
+        /// With `neighbors`: regions in all.
+        #[schema(nullable = false)]
+        regions: Option<u64>,
+        /// With `neighbors`: regions that are not filtered yet.
+        #[schema(nullable = false)]
+        regions_open: Option<u64>,
     }
 
     /// All images.
     struct Images {
         /// By id.
-        images: Vec<Image>,
+        images: Vec<ListedImage>,
+    }
+
+    /// An image's summary; if it cannot be read, only what is known all the same.
+    struct ListedImage {
+        /// Its id.
+        id: String,
+        /// Width in pixels.
+        #[schema(nullable = false)]
+        width: Option<u32>,
+        /// Height in pixels.
+        #[schema(nullable = false)]
+        height: Option<u32>,
+        /// How it is filtered.
+        #[schema(nullable = false)]
+        preset: Option<String>,
+        /// Keys every random draw.
+        #[schema(nullable = false)]
+        seed: Option<u64>,
+        /// Every parameter of the preset, in words.
+        #[schema(nullable = false)]
+        parameters: Option<BTreeMap<String, String>>,
+        /// `client` or `neighbors`: who brings the context around tiles.
+        #[schema(nullable = false)]
+        halo: Option<String>,
+        /// Whether every pixel is filtered and stored.
+        #[schema(nullable = false)]
+        complete: Option<bool>,
+        /// Whether it takes no more tiles.
+        #[schema(nullable = false)]
+        finished: Option<bool>,
+        /// Tiles filtered and stored; with `neighbors` these are regions, or parts of them.
+        #[schema(nullable = false)]
+        tiles_done: Option<u64>,
+        /// Pixels of the image.
+        #[schema(nullable = false)]
+        pixels: Option<u64>,
+        /// Pixels filtered and stored.
+        #[schema(nullable = false)]
+        pixels_done: Option<u64>,
+        /// Bytes of disk that are set aside for it.
+        #[schema(nullable = false)]
+        disk: Option<u64>,
+        /// Seconds since 1970 at which it is forgotten, if nobody uses it until then.
+        expires: u64,
+        /// With `neighbors`: cores that have come.
+        #[schema(nullable = false)]
+        tiles_stored: Option<u64>,
+        /// With `neighbors`: their pixels.
+        #[schema(nullable = false)]
+        pixels_stored: Option<u64>,
+        /// With `neighbors`: regions in all.
+        #[schema(nullable = false)]
+        regions: Option<u64>,
+        /// With `neighbors`: regions that are not filtered yet.
+        #[schema(nullable = false)]
+        regions_open: Option<u64>,
+        /// Which file is damaged, if one is.
+        #[schema(nullable = false)]
+        damaged: Option<String>,
     }
 
     /// All about one image.
@@ -368,20 +485,59 @@ schemas! {
         seed: u64,
         /// Every parameter of the preset, in words.
         parameters: BTreeMap<String, String>,
-        /// Whether every pixel is stored.
+        /// `client` or `neighbors`: who brings the context around tiles.
+        halo: String,
+        /// Whether every pixel is filtered and stored.
         complete: bool,
-        /// Tiles stored.
+        /// Whether it takes no more tiles.
+        finished: bool,
+        /// Tiles filtered and stored; with `neighbors` these are regions, or parts of them.
         tiles_done: u64,
         /// Pixels of the image.
         pixels: u64,
-        /// Pixels stored.
+        /// Pixels filtered and stored.
         pixels_done: u64,
+        /// Bytes of disk that are set aside for it.
+        disk: u64,
+        /// Seconds since 1970 at which it is forgotten, if nobody uses it until then.
+        expires: u64,
+        /// With `neighbors`: cores that have come.
+        #[schema(nullable = false)]
+        tiles_stored: Option<u64>,
+        /// With `neighbors`: their pixels.
+        #[schema(nullable = false)]
+        pixels_stored: Option<u64>,
+        /// With `neighbors`: regions in all.
+        #[schema(nullable = false)]
+        regions: Option<u64>,
+        /// With `neighbors`: regions that are not filtered yet.
+        #[schema(nullable = false)]
+        regions_open: Option<u64>,
         /// Regions that are not stored: x, y, width, height.
         missing: Vec<[u32; 4]>,
         /// The tiles stored, by rows.
         tiles: Vec<TileStatus>,
         /// Sums of the tiles' reports.
         totals: Totals,
+        /// With `neighbors`: the regions that are not filtered, by rows.
+        #[schema(nullable = false)]
+        waiting: Option<Vec<WaitingRegion>>,
+        /// With `neighbors`: what keeps regions from being filtered, until it is tried again.
+        trouble: Option<Problem>,
+    }
+
+    /// A region that is not filtered yet.
+    struct WaitingRegion {
+        /// The region: x, y, width, height.
+        region: [u32; 4],
+        /// `waiting`, `ready` or `running`.
+        state: String,
+        /// If it waits: what is missing of the pixels that it reads, the first 16.
+        #[schema(nullable = false)]
+        r#for: Option<Vec<[u32; 4]>>,
+        /// If it waits: how many there are.
+        #[schema(nullable = false)]
+        for_regions: Option<u64>,
     }
 
     /// A tile that is stored.
@@ -504,14 +660,14 @@ schemas! {
 
     /// A line of the answer to tiles. What is not said of a state is absent.
     struct TileLine {
-        /// `filtered`, `repeated`, `error` or `end`; skip what you do not know.
+        /// `filtered`, `stored`, `repeated`, `error` or `end`; skip what you do not know.
         state: String,
         /// Its core: x, y, width, height; null if it is not known which tile it was.
         tile: Option<[u32; 4]>,
         /// With `error`: what is wrong.
         #[schema(nullable = false)]
         problem: Option<Problem>,
-        /// With `end`: tiles filtered or repeated, as a number.
+        /// With `end`: tiles filtered, stored or repeated, as a number.
         #[schema(nullable = false)]
         tiles: Option<u64>,
         /// With `end`: tiles refused.

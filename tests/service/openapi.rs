@@ -134,6 +134,18 @@ fn its_schemas_are_those_of_real_answers() {
     let status = server.get("/v1/images/z").json();
     assert!(status["totals"]["left_out"].as_array().is_some_and(|all| !all.is_empty()), "{status}");
     fits(&status, "ImageStatus");
+    // Bare cores: one has come, others are waited for, and then not any more.
+    let opening = super::neighbors::opening("n", [64, 64], "lean", ("samples", 4));
+    fits(&serde_json::from_slice(&opening).unwrap(), "OpenImage");
+    fits(&server.post("/v1/images", &opening).json(), "Image");
+    for line in server.post("/v1/images/n/tiles", &tile([64, 64], Rect::new(0, 0, 16, 16), 0)).lines() {
+        fits(&line, "TileLine");
+    }
+    let status = server.get("/v1/images/n").json();
+    assert!(status["waiting"].as_array().is_some_and(|all| !all.is_empty()), "{status}");
+    fits(&status, "ImageStatus");
+    fits(&server.get("/v1/images").json(), "Images");
+    fits(&server.post("/v1/images/n/finish", b"").json(), "Image");
     fits(&server.get("/v1/images/y").json(), "Problem");
 }
 
