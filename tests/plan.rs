@@ -1,5 +1,5 @@
 //! What `filter::plan` says is never exceeded, and never more than a quarter too high: measured by counting every
-//! allocation of the process. A test binary of its own, so that nothing else allocates meanwhile.
+//! allocation of the process. A test binary of its own, one test at a time, so that nothing else allocates meanwhile.
 
 use peak_alloc::PeakAlloc;
 use rpfd::filter::plan::{Shape, plan};
@@ -7,8 +7,13 @@ use rpfd::filter::{
     Channel, ChannelSet, Counts, Execution, Method, Plane, Rect, Role, SampleTile, TileGeometry, filter,
 };
 
+use std::sync::Mutex;
+
 #[global_allocator]
 static ALLOCATIONS: PeakAlloc = PeakAlloc;
+
+/// Held by whichever test counts.
+static COUNTING: Mutex<()> = Mutex::new(());
 
 /// Channels with so many features and random parameters.
 fn channels(features: u32, random: u32) -> ChannelSet {
@@ -60,6 +65,7 @@ fn measure(
 /// tenths of the samples.
 #[test]
 fn a_tile_takes_its_samples_once_and_three_tenths_more() {
+    let _alone = COUNTING.lock();
     let whole = Rect::new(0, 0, 96, 96);
     let geometry = TileGeometry::with_halo([96, 96], whole, 0).expect("a valid geometry");
     // Film 2, colour 3, features 15, random parameters 7 in pairs and one alone.
@@ -95,6 +101,7 @@ fn a_tile_takes_its_samples_once_and_three_tenths_more() {
 
 #[test]
 fn plans_are_upper_bounds_and_tight() {
+    let _alone = COUNTING.lock();
     let tile = |image: u32, core: u32, halo: u32| {
         let at = (image - core) / 2;
         TileGeometry::with_halo([image, image], Rect::new(at, at, core, core), halo).expect("a valid geometry")
