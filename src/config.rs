@@ -1,72 +1,21 @@
 //! What the service is told when it starts: one [`Config`], checked as a whole.
 //!
-//! Zero never means unlimited: it is refused.
+//! Every setting is one entry of the table in this file: its name is the key of the file, the flag (`--queue-deadline`)
+//! and the environment variable (`RPFD_QUEUE_DEADLINE`); [`load`] reads these. Zero never means unlimited: it is refused.
+
+pub mod load;
+mod value;
 
 use crate::filter::SimdLevel;
 use std::{
     fmt,
     net::{Ipv4Addr, SocketAddr},
     path::PathBuf,
-    str::FromStr,
     time::Duration,
 };
 
-/// A number of bytes. Read from `512MiB`, `2GiB`, `64kB` or plain bytes; binary units count by 1024, decimal by 1000.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct ByteSize(pub u64);
-
-/// Units by their names, the largest first of each kind.
-const UNITS: [(&str, u64); 9] = [
-    ("TiB", 1 << 40),
-    ("GiB", 1 << 30),
-    ("MiB", 1 << 20),
-    ("KiB", 1 << 10),
-    ("TB", 1_000_000_000_000),
-    ("GB", 1_000_000_000),
-    ("MB", 1_000_000),
-    ("kB", 1000),
-    ("B", 1),
-];
-
-/// A text that is no size.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0:?} is no size: write bytes or a number and a unit, like 536870912, 512MiB, 1.5GiB or 2GB")]
-pub struct SizeError(String);
-
-impl FromStr for ByteSize {
-    type Err = SizeError;
-
-    fn from_str(text: &str) -> Result<Self, SizeError> {
-        let wrong = || SizeError(text.to_owned());
-        let trimmed = text.trim();
-        let end = trimmed.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(trimmed.len());
-        let (number, unit) = (&trimmed[..end], trimmed[end..].trim());
-        let unit = match unit {
-            "" => 1,
-            unit => UNITS.iter().find(|(name, _)| name.eq_ignore_ascii_case(unit)).ok_or_else(wrong)?.1,
-        };
-        let (whole, part) = number.split_once('.').unwrap_or((number, "0"));
-        let digits = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
-        // Parts of a unit to 9 digits; parts of a byte mean nothing.
-        if !digits(whole) || !digits(part) || part.len() > 9 || (unit == 1 && number.contains('.')) {
-            return Err(wrong());
-        }
-        let whole = whole.parse::<u64>().ok().and_then(|n| n.checked_mul(unit)).ok_or_else(wrong)?;
-        let scale = 10u128.pow(part.len() as u32);
-        let part = part.parse::<u128>().map_err(|_| wrong())? * u128::from(unit) / scale;
-        whole.checked_add(part as u64).map(Self).ok_or_else(wrong)
-    }
-}
-
-impl fmt::Display for ByteSize {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let exact = |(_, unit): &&(&str, u64)| self.0 >= *unit && self.0.is_multiple_of(*unit);
-        match UNITS[..4].iter().find(exact) {
-            Some((name, unit)) => write!(f, "{}{name}", self.0 / unit),
-            None => write!(f, "{}B", self.0),
-        }
-    }
-}
+use value::Value;
+pub use value::{ByteSize, LogFormat, SizeError};
 
 /// Least memory that makes a service: 1 MiB.
 pub const MIN_MEMORY: u64 = 1 << 20;
@@ -82,61 +31,159 @@ pub const MAX_DISK: u64 = 1 << 60;
 pub const MAX_TTL: Duration = Duration::from_secs(10 * 365 * 86_400);
 /// Longest deadline: a day.
 pub const MAX_DEADLINE: Duration = Duration::from_secs(86_400);
+/// Most of whatever is counted one by one: connections, requests, images.
+pub const MAX_COUNT: usize = 65536;
 
-/// What the service is told when it starts.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Config {
-    /// Where to listen; port 0 takes any that is free.
-    pub listen: SocketAddr,
-    /// Bytes that tiles may hold at once: samples, buffers of the filter, results. [`MIN_MEMORY`] to [`MAX_MEMORY`].
-    pub memory: ByteSize,
-    /// Threads that filter: 1 to [`MAX_THREADS`].
-    pub threads: usize,
-    /// SIMD instructions that they filter with.
-    pub simd: SimdLevel,
-    /// Folder for images, and for results that nobody has read yet; made if it is not there. One service at a time.
-    pub data_dir: PathBuf,
-    /// How long a tile may wait for memory before it is refused.
-    pub queue_deadline: Duration,
-    /// How long the head of a request may take, and a connection be idle between requests.
-    pub header_deadline: Duration,
-    /// How long a request's body may bring nothing while the service waits for it.
-    pub idle_deadline: Duration,
-    /// How long requests may go on after the service was told to stop.
-    pub shutdown_deadline: Duration,
-    /// Connections at once; more wait to be accepted. 1 to 65536.
-    pub connections: usize,
-    /// Images open at once. 1 to 65536.
-    pub images: usize,
-    /// Bytes of disk that all images may take; what one takes at worst is set aside when it is opened. 1 MiB to 1 EiB.
-    pub disk: ByteSize,
-    /// How long an image is kept that nobody uses: a second to ten years.
-    pub image_ttl: Duration,
-    /// Pixels of an image at most; its canvas takes 12 bytes of disk for each. 1 to [`MAX_IMAGE_PIXELS`].
-    pub image_pixels: u64,
+/// One setting, apart from its type.
+pub(crate) struct Setting {
+    /// `snake_case`, as in the file.
+    pub(crate) name: &'static str,
+    /// What stands for its value in the help; empty for a switch.
+    pub(crate) value: &'static str,
+    /// What it is, one line each.
+    pub(crate) help: &'static [&'static str],
+    pub(crate) read: fn(&mut Config, &str) -> Result<(), String>,
+    pub(crate) to_toml: fn(&Config) -> Option<String>,
+    /// What would be right, if its value is not.
+    pub(crate) check: fn(&Config) -> Option<&'static str>,
 }
 
-impl Default for Config {
-    fn default() -> Self {
-        let temporary = std::env::var_os("TMPDIR").map_or_else(|| PathBuf::from("/var/tmp"), PathBuf::from);
-        let data_dir = temporary.join("rpfd");
-        Self {
-            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)),
-            memory: ByteSize(1 << 30),
-            threads: std::thread::available_parallelism().map_or(1, |n| n.get().min(MAX_THREADS)),
-            simd: SimdLevel::default(),
-            data_dir,
-            queue_deadline: Duration::from_secs(60),
-            header_deadline: Duration::from_secs(15),
-            idle_deadline: Duration::from_secs(30),
-            shutdown_deadline: Duration::from_secs(20),
-            connections: 1024,
-            images: 1024,
-            disk: ByteSize(64 << 30),
-            image_ttl: Duration::from_secs(7 * 86_400),
-            image_pixels: 1 << 30,
+/// Makes the struct, its defaults, and the table of settings, from one list.
+macro_rules! settings {
+    ($($(#[doc = $doc:literal])+ $name:ident: $type:ty = $default:expr, $value:literal, $fine:expr, $right:literal;)+) => {
+        /// What the service is told when it starts.
+        #[derive(Clone, Debug, PartialEq)]
+        pub struct Config {
+            $($(#[doc = $doc])+ pub $name: $type,)+
         }
-    }
+
+        impl Default for Config {
+            fn default() -> Self {
+                Self { $($name: $default,)+ }
+            }
+        }
+
+        /// All settings, in the order in which they are printed.
+        pub(crate) static SETTINGS: &[Setting] = &[$(Setting {
+            name: stringify!($name),
+            value: $value,
+            help: &[$($doc),+],
+            read: |config, text| {
+                config.$name = Value::read(text)?;
+                Ok(())
+            },
+            to_toml: |config| config.$name.to_toml(),
+            check: |config| {
+                let fine: fn(&$type) -> bool = $fine;
+                if fine(&config.$name) { None } else { Some($right) }
+            },
+        },)+];
+    };
+}
+
+fn deadline(value: &Duration) -> bool {
+    !value.is_zero() && *value <= MAX_DEADLINE
+}
+
+fn count(value: &usize) -> bool {
+    (1..=MAX_COUNT).contains(value)
+}
+
+settings! {
+    /// Address to listen on; port 0 takes any that is free. Other than loopback only with token_file
+    listen: SocketAddr = SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)), "ADDRESS", |_| true, "";
+
+    /// Address on which Prometheus metrics are served, at /metrics and without tokens; nowhere if it is not set
+    metrics_listen: Option<SocketAddr> = None, "ADDRESS", |_| true, "";
+
+    /// File of bearer tokens, read again at SIGHUP; `rpfd token` makes its entries. Not set: whoever can connect may do
+    /// everything
+    token_file: Option<PathBuf> = None, "FILE", |_| true, "";
+
+    /// Listen beyond loopback without tokens: for networks that let nobody else in
+    insecure_no_auth: bool = false, "", |_| true, "";
+
+    /// Folder for images and unread results, of this service alone; made if it is not there. By default rpfd in $TMPDIR or
+    /// /var/tmp
+    data_dir: PathBuf = PathBuf::from(
+        std::env::var_os("TMPDIR").filter(|dir| !dir.is_empty()).unwrap_or_else(|| "/var/tmp".into())
+    ).join("rpfd"),
+        "DIR", |dir| !dir.as_os_str().is_empty(), "must name a folder";
+
+    /// Memory for tiles at work (samples, the filter's buffers, results) and, a share of it (a quarter up to 64 MiB, then
+    /// an eighth), for requests. 1MiB to 4TiB less 1KiB
+    memory: ByteSize = ByteSize(1 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_MEMORY).contains(&size.0),
+        "must be 1MiB to 4TiB less 1KiB";
+
+    /// Free space of the data folder's file system below which the service says that it is not ready. 4KiB at least
+    disk_reserve: ByteSize = ByteSize(256 << 20), "SIZE", |size| size.0 >= 4096, "must be 4KiB at least";
+
+    /// Threads that filter, 1 to 1024. By default one per CPU
+    threads: usize = std::thread::available_parallelism().map_or(1, |n| n.get().min(MAX_THREADS)), "N",
+        |n| (1..=MAX_THREADS).contains(n), "must be 1 to 1024";
+
+    /// SIMD instructions to filter with, for the same bits in more time: auto for the best that this CPU has, or one of
+    /// its levels, like sse4.2 or avx2
+    simd: SimdLevel = SimdLevel::default(), "LEVEL", |_| true, "";
+
+    /// Connections at once; more wait to be accepted. 1 to 65536
+    connections: usize = 1024, "N", count, "must be 1 to 65536";
+
+    /// Requests at once on one HTTP/2 connection; more wait at the client. 1 to 1000
+    streams: u32 = 32, "N", |n| (1..=1000).contains(n), "must be 1 to 1000";
+
+    /// Requests at once, in all; more are refused. 1 to 65536
+    requests: usize = 2048, "N", count, "must be 1 to 65536";
+
+    /// Requests at once with one token, unless the token file says otherwise; more are refused. 1 to 65536
+    token_requests: usize = 512, "N", count, "must be 1 to 65536";
+
+    /// Images open at once. 1 to 65536
+    images: usize = 1024, "N", count, "must be 1 to 65536";
+
+    /// Disk for all images; what one takes at worst is set aside when it is opened. 1MiB to 1EiB
+    disk: ByteSize = ByteSize(64 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_DISK).contains(&size.0),
+        "must be 1MiB to 1EiB";
+
+    /// How long an image is kept that nobody uses. A second to ten years
+    image_ttl: Duration = Duration::from_secs(7 * 86_400), "TIME",
+        |time| (Duration::from_secs(1)..=MAX_TTL).contains(time), "must be a second to ten years";
+
+    /// Pixels of an image, at most; its canvas takes 12 bytes of disk for each. 1 to 2^40
+    image_pixels: u64 = 1 << 30, "N", |n| (1..=MAX_IMAGE_PIXELS).contains(n), "must be 1 to 2^40";
+
+    /// Requests that may wait for memory at once; more are refused. 1 to 65536
+    queue: usize = 1024, "N", count, "must be 1 to 65536";
+
+    /// Disk for results that nobody has read yet, of all requests. 1MiB to 4TiB less 1KiB
+    unread_results: ByteSize = ByteSize(4 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_MEMORY).contains(&size.0),
+        "must be 1MiB to 4TiB less 1KiB";
+
+    /// Bytes a second that a client must bring, or take, over each idle_deadline that it is waited for. 1B to 1GiB
+    min_rate: ByteSize = ByteSize(16 << 10), "SIZE", |rate| (1..=1 << 30).contains(&rate.0), "must be 1B to 1GiB";
+
+    /// How long a tile may wait for memory before it is refused. Up to a day, like all deadlines
+    queue_deadline: Duration = Duration::from_secs(60), "TIME", deadline, "must be more than 0 and a day at most";
+
+    /// How long the head of a request may take, and a connection be idle between requests
+    header_deadline: Duration = Duration::from_secs(15), "TIME", deadline, "must be more than 0 and a day at most";
+
+    /// How long a request's body may bring nothing while the service waits for it, and a client that has sent all take
+    /// nothing of the answer
+    idle_deadline: Duration = Duration::from_secs(30), "TIME", deadline, "must be more than 0 and a day at most";
+
+    /// How long filtering one tile may take
+    work_deadline: Duration = Duration::from_secs(3600), "TIME", deadline, "must be more than 0 and a day at most";
+
+    /// How long requests may go on after the service was told to stop
+    shutdown_deadline: Duration = Duration::from_secs(20), "TIME", deadline, "must be more than 0 and a day at most";
+
+    /// What is logged, in the words of RUST_LOG, which takes its place if it is set
+    log: String = "info".to_owned(), "FILTER",
+        |log| tracing_subscriber::EnvFilter::try_new(log).is_ok(), "must be like info, or warn,rpfd=debug";
+
+    /// How the log is written: text or json
+    log_format: LogFormat = LogFormat::Text, "FORMAT", |_| true, "";
 }
 
 /// All that is wrong with a configuration, one line each.
@@ -147,36 +194,32 @@ pub struct ConfigError(pub Vec<String>);
 impl Config {
     /// Checks all of it, and says all that is wrong.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let mut wrong = Vec::new();
-        let mut rule = |fine: bool, name: &str, value: &dyn fmt::Display, right: &str| {
-            if !fine {
-                wrong.push(format!("{name} = {value}: {right}"));
-            }
-        };
-        let memory = (MIN_MEMORY..=MAX_MEMORY).contains(&self.memory.0);
-        rule(memory, "memory", &self.memory, "must be 1MiB to 4TiB less 1KiB");
-        rule((1..=MAX_THREADS).contains(&self.threads), "threads", &self.threads, "must be 1 to 1024");
-        rule(!self.data_dir.as_os_str().is_empty(), "data_dir", &self.data_dir.display(), "must name a folder");
-        for (name, deadline) in [
-            ("queue_deadline", self.queue_deadline),
-            ("header_deadline", self.header_deadline),
-            ("idle_deadline", self.idle_deadline),
-            ("shutdown_deadline", self.shutdown_deadline),
-        ] {
-            let fine = !deadline.is_zero() && deadline <= MAX_DEADLINE;
-            rule(fine, name, &format_args!("{}s", deadline.as_secs_f64()), "must be more than 0 and a day at most");
-        }
-        for (name, count) in [("connections", self.connections), ("images", self.images)] {
-            rule((1..=65536).contains(&count), name, &count, "must be 1 to 65536");
-        }
-        let disk = (MIN_MEMORY..=MAX_DISK).contains(&self.disk.0);
-        rule(disk, "disk", &self.disk, "must be 1MiB to 1EiB");
-        let ttl = (Duration::from_secs(1)..=MAX_TTL).contains(&self.image_ttl);
-        let seconds = format_args!("{}s", self.image_ttl.as_secs_f64()).to_string();
-        rule(ttl, "image_ttl", &seconds, "must be a second to ten years");
-        let pixels = (1..=MAX_IMAGE_PIXELS).contains(&self.image_pixels);
-        rule(pixels, "image_pixels", &self.image_pixels, "must be 1 to 2^40");
+        let wrong = self.faults(|setting| setting.name.to_owned());
         if wrong.is_empty() { Ok(()) } else { Err(ConfigError(wrong)) }
+    }
+
+    /// What is wrong with each setting, which goes by the name that `named` gives it.
+    fn faults(&self, named: impl Fn(&Setting) -> String) -> Vec<String> {
+        let shown = |setting: &Setting| (setting.to_toml)(self).unwrap_or_else(|| "unset".to_owned());
+        let one =
+            |setting: &&Setting| Some(format!("{} = {}: {}", named(setting), shown(setting), (setting.check)(self)?));
+        let mut wrong: Vec<String> = SETTINGS.iter().filter_map(|setting| one(&setting)).collect();
+        if !self.listen.ip().to_canonical().is_loopback() && self.token_file.is_none() && !self.insecure_no_auth {
+            let name = SETTINGS.iter().find(|setting| setting.name == "listen").map(&named).unwrap_or_default();
+            wrong.push(format!(
+                "{name} = \"{}\": whoever reaches this address could use the service, as no tokens are set. Set token_file \
+                 (rpfd token makes its entries), or listen on loopback (127.0.0.1 or [::1]) behind a proxy; \
+                 insecure_no_auth = true serves without tokens all the same",
+                self.listen
+            ));
+        }
+        wrong
+    }
+}
+
+impl fmt::Debug for Setting {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name)
     }
 }
 
@@ -185,51 +228,39 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_are_read_and_written() {
-        for (text, bytes) in [
-            ("0", 0),
-            ("1048576", 1 << 20),
-            ("512MiB", 512 << 20),
-            ("2 GiB", 2 << 30),
-            ("2gib", 2 << 30),
-            ("1.5GiB", 3 << 29),
-            ("64kB", 64_000),
-            ("0.1KiB", 102),
-            ("16777215TiB", u64::MAX - ((1 << 40) - 1)),
-            ("18446744073709551615B", u64::MAX),
-        ] {
-            assert_eq!(text.parse(), Ok(ByteSize(bytes)), "{text}");
-        }
-        for text in ["", "MiB", "1.5", "1.", ".5MiB", "-1", "1e3", "12 parsecs", "16777216TiB", "18446744073709551616"]
-        {
-            let error = text.parse::<ByteSize>().unwrap_err().to_string();
-            assert!(error.contains(&format!("{text:?}")) && error.contains("512MiB"), "{error}");
-        }
-        for bytes in [0, 1, 1023, 1 << 10, 3 << 29, (1 << 30) + 1, u64::MAX] {
-            assert_eq!(ByteSize(bytes).to_string().parse(), Ok(ByteSize(bytes)));
-        }
-        assert_eq!(ByteSize(512 << 20).to_string(), "512MiB");
-    }
-
-    #[test]
     fn all_errors_come_at_once() {
         assert_eq!(Config::default().validate(), Ok(()));
         let zero = Config {
+            listen: SocketAddr::from(([0, 0, 0, 0], 8080)),
             memory: ByteSize(0),
+            disk_reserve: ByteSize(0),
             threads: 0,
             data_dir: PathBuf::new(),
             queue_deadline: Duration::ZERO,
             header_deadline: Duration::ZERO,
             idle_deadline: Duration::ZERO,
+            min_rate: ByteSize(0),
+            work_deadline: Duration::ZERO,
+            queue: 0,
+            unread_results: ByteSize(0),
             shutdown_deadline: Duration::ZERO,
             connections: 0,
+            streams: 0,
+            requests: 0,
+            token_requests: 0,
             images: 0,
             disk: ByteSize(0),
             image_ttl: Duration::ZERO,
             image_pixels: 0,
-            ..Config::default()
+            log: "a=b=c".to_owned(),
+            metrics_listen: None,
+            token_file: None,
+            insecure_no_auth: false,
+            log_format: LogFormat::Text,
+            simd: SimdLevel::default(),
         };
-        assert_eq!(zero.validate().unwrap_err().0.len(), 12);
+        // All but those that have no wrong value.
+        assert_eq!(zero.validate().unwrap_err().0.len(), SETTINGS.len() - 5);
     }
 
     #[test]
@@ -244,11 +275,32 @@ mod tests {
         assert!(with(&|c| c.memory.0 = MAX_MEMORY) && !with(&|c| c.memory.0 = MAX_MEMORY + 1));
         assert!(with(&|c| c.threads = MAX_THREADS) && !with(&|c| c.threads = MAX_THREADS + 1));
         assert!(with(&|c| c.idle_deadline = MAX_DEADLINE) && !with(&|c| c.idle_deadline = MAX_DEADLINE + second));
+        assert!(with(&|c| c.connections = MAX_COUNT) && !with(&|c| c.connections = MAX_COUNT + 1));
+        assert!(with(&|c| c.requests = MAX_COUNT) && !with(&|c| c.requests = MAX_COUNT + 1));
+        assert!(with(&|c| c.token_requests = MAX_COUNT) && !with(&|c| c.token_requests = MAX_COUNT + 1));
+        assert!(with(&|c| c.streams = 1000) && !with(&|c| c.streams = 1001));
+        assert!(with(&|c| c.disk_reserve.0 = 4096) && !with(&|c| c.disk_reserve.0 = 4095));
+        assert!(with(&|c| c.image_pixels = MAX_IMAGE_PIXELS) && !with(&|c| c.image_pixels = MAX_IMAGE_PIXELS + 1));
         assert!(with(&|c| c.disk.0 = MAX_DISK) && !with(&|c| c.disk.0 = MAX_DISK + 1));
         assert!(with(&|c| c.image_ttl = second) && !with(&|c| c.image_ttl = second / 2));
         assert!(with(&|c| c.image_ttl = MAX_TTL) && !with(&|c| c.image_ttl = MAX_TTL + second));
-        assert!(with(&|c| c.connections = 65536) && !with(&|c| c.connections = 65537));
-        assert!(with(&|c| c.image_pixels = MAX_IMAGE_PIXELS) && !with(&|c| c.image_pixels = MAX_IMAGE_PIXELS + 1));
-        assert!(with(&|c| c.images = 1) && !with(&|c| c.images = 65537));
+        assert!(with(&|c| c.queue = MAX_COUNT) && !with(&|c| c.queue = MAX_COUNT + 1));
+        assert!(with(&|c| c.work_deadline = MAX_DEADLINE) && !with(&|c| c.work_deadline = MAX_DEADLINE + second));
+        assert!(with(&|c| c.min_rate.0 = 1 << 30) && !with(&|c| c.min_rate.0 = (1 << 30) + 1));
+        assert!(with(&|c| c.unread_results.0 = MIN_MEMORY) && !with(&|c| c.unread_results.0 = MIN_MEMORY - 1));
+        assert!(with(&|c| c.images = 1) && !with(&|c| c.images = MAX_COUNT + 1));
+    }
+
+    #[test]
+    fn only_loopback_goes_without_tokens() {
+        let config = |listen: &str| Config { listen: listen.parse().unwrap(), ..Config::default() };
+        for loopback in ["127.0.0.1:0", "127.3.2.1:80", "[::1]:8080", "[::ffff:127.0.0.1]:80"] {
+            assert_eq!(config(loopback).validate(), Ok(()));
+        }
+        for other in ["0.0.0.0:0", "[::]:80", "10.0.0.1:80", "[::ffff:10.0.0.1]:80"] {
+            assert!(config(other).validate().unwrap_err().0[0].contains("token_file"));
+            assert_eq!(Config { token_file: Some("x".into()), ..config(other) }.validate(), Ok(()));
+            assert_eq!(Config { insecure_no_auth: true, ..config(other) }.validate(), Ok(()));
+        }
     }
 }

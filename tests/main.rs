@@ -3,6 +3,7 @@
 
 mod cli;
 mod fault;
+mod load;
 mod quality;
 mod service;
 mod stitch;

@@ -1,14 +1,21 @@
-//! The memory budget: bytes are reserved before they are allocated.
+//! The budget: bytes are reserved before they are allocated, or written.
 //!
-//! A [`Budget`] hands out [`Permit`]s, first come, first served: a large request that waits is not overtaken by small ones
-//! that would fit. A permit travels with the data it was taken for and gives its bytes back when it is dropped. It knows
+//! A [`Budget`] hands out [`Permit`]s. A permit travels with the data it was taken for and gives its bytes back when it is
+//! dropped. Who waits is served first come, first served, but for this: a request that fits now may pass larger ones that
+//! do not, as long as each of them is passed by no more bytes in all than it asks for itself. So a large request waits at
+//! most about twice as long as in a strict queue, and small ones need not wait while bytes lie idle for it. It knows
 //! nothing of what the bytes are for, nor of HTTP.
 
-use std::{sync::Arc, time::Duration};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+mod drain;
 
-/// What is counted: 1 KiB, so that a semaphore's 32 bits reach to 4 TiB.
-const UNIT: u64 = 1024;
+use std::{
+    collections::VecDeque,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use drain::Drain;
+use tokio::sync::oneshot;
 
 /// Why bytes were not reserved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -22,13 +29,15 @@ pub enum AdmissionError {
         /// Bytes that would fit: all there are.
         total: u64,
     },
-    /// Others held the bytes for too long.
-    #[error("{needed} bytes did not become free within {} seconds", deadline.as_secs_f32())]
+    /// Others held the bytes for too long, or too many waited already.
+    #[error("{needed} bytes did not become free within {} seconds", waited.as_secs_f32())]
     Busy {
         /// Bytes asked for.
         needed: u64,
-        /// How long it waited.
-        deadline: Duration,
+        /// How long it waited; not at all if the queue was full.
+        waited: Duration,
+        /// When the bytes are likely to be free, by how fast others have given theirs back.
+        retry_after: Duration,
     },
 }
 
@@ -45,39 +54,128 @@ impl AdmissionError {
 /// Bytes that may be in use at once, over all holders.
 #[derive(Clone, Debug)]
 pub struct Budget {
-    semaphore: Arc<Semaphore>,
-    units: u32,
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    total: u64,
+    /// Requests that may wait.
+    places: usize,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    free: u64,
+    queue: VecDeque<Waiter>,
+    /// Tells waiters apart.
+    next: u64,
+    drain: Drain,
+}
+
+#[derive(Debug)]
+struct Waiter {
+    id: u64,
+    bytes: u64,
+    /// Bytes by which others may still pass it.
+    patience: u64,
+    granted: oneshot::Sender<Permit>,
+}
+
+impl State {
+    /// Takes out of the queue all whose turn it is, and their bytes out of what is free.
+    fn admit(&mut self) -> Vec<Waiter> {
+        let mut admitted = Vec::new();
+        let (mut index, mut patience) = (0, u64::MAX);
+        while let Some(waiter) = self.queue.get(index) {
+            let bytes = waiter.bytes;
+            if bytes <= self.free && bytes <= patience {
+                self.queue.iter_mut().take(index).for_each(|ahead| ahead.patience -= bytes);
+                patience -= if index > 0 { bytes } else { 0 };
+                self.free -= bytes;
+                admitted.extend(self.queue.remove(index));
+            } else {
+                patience = patience.min(waiter.patience);
+                index += 1;
+            }
+        }
+        admitted
+    }
+
+    /// How long until so many more bytes are likely to be free, behind everyone who waits.
+    fn wait(&self, bytes: u64, total: u64) -> Option<Duration> {
+        let waiting: u64 = self.queue.iter().map(|waiter| waiter.bytes).fold(bytes, u64::saturating_add);
+        self.drain.time_for(waiting.saturating_sub(self.free), total)
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A place in the queue, given up when it is dropped.
+struct Place {
+    budget: Budget,
+    id: u64,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.budget.change(|state| state.queue.retain(|waiter| waiter.id != self.id));
+    }
 }
 
 impl Budget {
-    /// A budget of so many bytes, rounded down to whole KiB; at most 4 TiB.
-    pub fn new(bytes: u64) -> Self {
-        let units = u32::try_from(bytes / UNIT).unwrap_or(u32::MAX);
-        // On 32 bits a semaphore counts less far.
-        let units = units.min(u32::try_from(Semaphore::MAX_PERMITS).unwrap_or(u32::MAX));
-        Self { semaphore: Arc::new(Semaphore::new(units as usize)), units }
+    /// A budget of so many bytes, for which so many requests may wait at once.
+    pub fn new(bytes: u64, places: usize) -> Self {
+        let state = State { free: bytes, queue: VecDeque::new(), next: 0, drain: Drain::default() };
+        Self { shared: Arc::new(Shared { total: bytes, places, state: Mutex::new(state) }) }
     }
 
     /// Bytes in all.
-    pub const fn total(&self) -> u64 {
-        self.units as u64 * UNIT
+    pub fn total(&self) -> u64 {
+        self.shared.total
     }
 
     /// Bytes that nobody holds.
     pub fn free(&self) -> u64 {
-        self.semaphore.available_permits() as u64 * UNIT
+        self.shared.lock().free
+    }
+
+    /// Requests that wait.
+    pub fn waiting(&self) -> usize {
+        self.shared.lock().queue.len()
     }
 
     /// Says whether so many bytes can ever be reserved.
-    pub const fn check(&self, bytes: u64) -> Result<(), AdmissionError> {
-        if bytes > self.total() {
-            return Err(AdmissionError::TooLarge { needed: bytes, total: self.total() });
-        }
-        Ok(())
+    pub fn check(&self, bytes: u64) -> Result<(), AdmissionError> {
+        let total = self.total();
+        if bytes > total { Err(AdmissionError::TooLarge { needed: bytes, total }) } else { Ok(()) }
     }
 
-    /// Reserves bytes, rounded up to whole KiB, after everyone who asked before; waits until `deadline` has passed.
-    /// Giving up, or dropping the future, loses the place in the queue and holds nothing.
+    /// Changes the state, and hands out what that has made free.
+    fn change<T>(&self, change: impl FnOnce(&mut State) -> T) -> T {
+        let mut state = self.shared.lock();
+        let (now, total) = (Instant::now(), self.shared.total);
+        let free = state.free;
+        state.drain.pass(now, total - free);
+        let changed = change(&mut state);
+        let given_back = state.free.saturating_sub(free);
+        state.drain.give_back(given_back);
+        let admitted = state.admit();
+        drop(state);
+        for waiter in admitted {
+            // Who has gone meanwhile drops the permit, which takes the lock again.
+            drop(waiter.granted.send(Permit { budget: self.clone(), bytes: waiter.bytes }));
+        }
+        changed
+    }
+
+    /// Reserves bytes when its turn comes; waits until `deadline` has passed. Giving up, or dropping the future, loses
+    /// the place in the queue and holds nothing.
     pub async fn reserve(&self, bytes: u64, deadline: Duration) -> Result<Permit, AdmissionError> {
         self.reserve_after(bytes, std::future::ready(()), deadline).await
     }
@@ -91,46 +189,87 @@ impl Budget {
         deadline: Duration,
     ) -> Result<Permit, AdmissionError> {
         self.check(bytes)?;
+        let busy = |waited, wait: Option<Duration>| {
+            // Nothing was given back yet: who waited in vain for so long may as well wait that long again.
+            Err(AdmissionError::Busy { needed: bytes, waited, retry_after: wait.unwrap_or(deadline) })
+        };
+        let (granted, grant) = oneshot::channel();
+        let queued = self.change(|state| {
+            if state.queue.len() >= self.shared.places && state.free < bytes {
+                return Err(state.wait(bytes, self.shared.total));
+            }
+            state.next += 1;
+            let id = state.next;
+            state.queue.push_back(Waiter { id, bytes, patience: bytes, granted });
+            Ok(id)
+        });
+        let _place = match queued {
+            Ok(id) => Place { budget: self.clone(), id },
+            Err(wait) => return busy(Duration::ZERO, wait),
+        };
         let late = async {
             own.await;
             tokio::time::sleep(deadline).await;
         };
         tokio::select! {
             biased;
-            // The semaphore is never closed.
-            Ok(permit) = Arc::clone(&self.semaphore).acquire_many_owned(units(bytes)) => Ok(Permit { permit }),
-            () = late => Err(AdmissionError::Busy { needed: bytes, deadline }),
+            // The sender is in the queue as long as the place is kept.
+            Ok(permit) = grant => Ok(permit),
+            () = late => busy(deadline, self.shared.lock().wait(0, self.shared.total)),
         }
     }
-}
-
-/// Units that hold so many bytes, which are within a budget.
-fn units(bytes: u64) -> u32 {
-    u32::try_from(bytes.div_ceil(UNIT)).unwrap_or(u32::MAX)
 }
 
 /// Reserved bytes; dropping it gives them back.
 #[derive(Debug)]
 pub struct Permit {
-    permit: OwnedSemaphorePermit,
+    budget: Budget,
+    bytes: u64,
 }
 
 impl Permit {
     /// Bytes that it holds.
-    pub fn bytes(&self) -> u64 {
-        self.permit.num_permits() as u64 * UNIT
+    pub const fn bytes(&self) -> u64 {
+        self.bytes
     }
 
-    /// Gives back all but `bytes`, rounded up to whole KiB; it never grows.
+    /// Gives back all but `bytes`; it never grows.
     pub fn shrink_to(&mut self, bytes: u64) {
-        let held = self.permit.num_permits();
-        drop(self.permit.split(held.saturating_sub(units(bytes) as usize)));
+        let surplus = self.bytes.saturating_sub(bytes);
+        if surplus > 0 {
+            self.bytes -= surplus;
+            self.budget.change(|state| state.free += surplus);
+        }
+    }
+
+    /// Takes as many more bytes as it needs to hold `bytes`, ahead of everyone who waits, and without waiting.
+    pub fn grow_to(&mut self, bytes: u64) -> Result<(), AdmissionError> {
+        self.budget.check(bytes)?;
+        let more = bytes.saturating_sub(self.bytes);
+        let total = self.budget.total();
+        self.budget.change(|state| {
+            if more > state.free {
+                let retry_after = state.wait(more, total).unwrap_or_default();
+                return Err(AdmissionError::Busy { needed: bytes, waited: Duration::ZERO, retry_after });
+            }
+            state.free -= more;
+            Ok(())
+        })?;
+        self.bytes += more;
+        Ok(())
+    }
+}
+
+impl Drop for Permit {
+    fn drop(&mut self) {
+        self.shrink_to(0);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use tokio::task::{JoinHandle, yield_now};
 
     const SOON: Duration = Duration::from_millis(20);
     const LATER: Duration = Duration::from_secs(20);
@@ -139,72 +278,94 @@ mod tests {
         tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap().block_on(work)
     }
 
+    /// A request that waits in the queue, if it must.
+    async fn ask(budget: &Budget, bytes: u64) -> JoinHandle<Permit> {
+        let budget = budget.clone();
+        let asked = tokio::spawn(async move { budget.reserve(bytes, LATER).await.unwrap() });
+        yield_now().await;
+        asked
+    }
+
     #[test]
     fn limits_are_exact() {
         run(async {
-            let budget = Budget::new(10 * UNIT + 1023);
-            assert_eq!(budget.total(), 10 * UNIT);
-            let all = budget.reserve(10 * UNIT, SOON).await.unwrap();
-            assert_eq!((all.bytes(), budget.free()), (10 * UNIT, 0));
+            let budget = Budget::new(10, 5);
+            let all = budget.reserve(10, SOON).await.unwrap();
+            assert_eq!((all.bytes(), budget.free()), (10, 0));
             let one = budget.reserve(1, SOON).await.unwrap_err();
-            assert_eq!(one, AdmissionError::Busy { needed: 1, deadline: SOON });
+            assert_eq!(one, AdmissionError::Busy { needed: 1, waited: SOON, retry_after: SOON });
             drop(all);
-            assert_eq!(budget.free(), 10 * UNIT);
+            assert_eq!(budget.free(), 10);
             // At once, not after the deadline.
-            let more = tokio::time::timeout(SOON, budget.reserve(10 * UNIT + 1, LATER)).await.unwrap().unwrap_err();
-            assert_eq!(more, AdmissionError::TooLarge { needed: 10 * UNIT + 1, total: 10 * UNIT });
+            let more = tokio::time::timeout(SOON, budget.reserve(11, LATER)).await.unwrap().unwrap_err();
+            assert_eq!(more, AdmissionError::TooLarge { needed: 11, total: 10 });
             assert!(budget.reserve(u64::MAX, LATER).await.is_err());
             assert_eq!(budget.reserve(0, SOON).await.unwrap().bytes(), 0);
+            let vast = Budget::new(u64::MAX, 1);
+            assert_eq!(vast.reserve(u64::MAX, SOON).await.unwrap().bytes(), u64::MAX);
         });
     }
 
     #[test]
-    fn counts_up_to_four_tebibytes() {
+    fn permits_shrink_and_grow_if_there_is_room() {
         run(async {
-            let budget = Budget::new(u64::MAX);
-            assert_eq!(budget.total(), u64::from(u32::MAX) * UNIT);
-            let all = budget.reserve(budget.total(), SOON).await.unwrap();
-            assert_eq!(all.bytes(), budget.total());
-        });
-    }
-
-    #[test]
-    fn permits_shrink_and_never_grow() {
-        run(async {
-            let budget = Budget::new(10 * UNIT);
-            let mut permit = budget.reserve(8 * UNIT, SOON).await.unwrap();
-            permit.shrink_to(9 * UNIT);
-            assert_eq!(permit.bytes(), 8 * UNIT);
-            permit.shrink_to(2 * UNIT + 1);
-            assert_eq!((permit.bytes(), budget.free()), (3 * UNIT, 7 * UNIT));
+            let budget = Budget::new(10, 5);
+            let mut permit = budget.reserve(8, SOON).await.unwrap();
+            permit.shrink_to(9);
+            assert_eq!(permit.bytes(), 8);
+            permit.shrink_to(3);
+            assert_eq!((permit.bytes(), budget.free()), (3, 7));
+            let large = ask(&budget, 8).await;
+            assert!(permit.grow_to(5).is_ok() && permit.grow_to(4).is_ok());
+            assert_eq!(permit.grow_to(11).unwrap_err().code(), "over_memory");
+            let other = budget.reserve(1, SOON).await.unwrap();
+            assert_eq!(permit.grow_to(10).unwrap_err().code(), "busy");
+            drop(other);
+            assert_eq!((permit.bytes(), budget.free()), (5, 5));
             permit.shrink_to(0);
-            assert_eq!(budget.free(), 10 * UNIT);
+            assert_eq!(large.await.unwrap().bytes(), 8);
+            assert_eq!(budget.free(), 10);
         });
     }
 
     #[test]
-    fn a_large_request_is_not_starved_by_small_ones() {
+    fn small_requests_pass_a_large_one_only_so_often() {
         run(async {
-            let budget = Budget::new(10 * UNIT);
-            let held = budget.reserve(6 * UNIT, SOON).await.unwrap();
-            let large = tokio::spawn({
-                let budget = budget.clone();
-                async move { budget.reserve(8 * UNIT, LATER).await }
-            });
-            tokio::task::yield_now().await;
-            // It would fit, but the large one came first.
-            assert_eq!(budget.reserve(UNIT, SOON).await.unwrap_err().code(), "busy");
+            let budget = Budget::new(12, 9);
+            let held = budget.reserve(8, SOON).await.unwrap();
+            let large = ask(&budget, 9).await;
+            // Each fits, and is done at once; but the large one lets no more than 9 bytes pass.
+            for _ in 0..3 {
+                assert_eq!(budget.reserve(3, SOON).await.unwrap().bytes(), 3);
+            }
+            let small = ask(&budget, 3).await;
+            assert!(!small.is_finished() && budget.free() == 4 && budget.waiting() == 2);
             drop(held);
-            let large = large.await.unwrap().unwrap();
-            assert_eq!((large.bytes(), budget.free()), (8 * UNIT, 2 * UNIT));
+            let large = large.await.unwrap();
+            // With the large one out of the way the next fits again.
+            assert_eq!((small.await.unwrap().bytes(), large.bytes(), budget.free()), (3, 9, 0));
+        });
+    }
+
+    #[test]
+    fn equals_are_served_in_their_order() {
+        run(async {
+            let budget = Budget::new(10, 9);
+            let held = budget.reserve(10, SOON).await.unwrap();
+            let asked = [ask(&budget, 6).await, ask(&budget, 6).await, ask(&budget, 6).await];
+            drop(held);
+            for asked in asked {
+                assert_eq!(asked.await.unwrap().bytes(), 6);
+            }
+            assert_eq!((budget.free(), budget.waiting()), (10, 0));
         });
     }
 
     #[test]
     fn the_deadline_starts_after_ones_own_work() {
         run(async {
-            let budget = Budget::new(10 * UNIT);
-            let held = budget.reserve(6 * UNIT, SOON).await.unwrap();
+            let budget = Budget::new(10, 5);
+            let held = budget.reserve(6, SOON).await.unwrap();
             let own = async {
                 tokio::time::sleep(4 * SOON).await;
             };
@@ -212,10 +373,10 @@ mod tests {
                 tokio::time::sleep(3 * SOON).await;
                 drop(held);
             };
-            let (reserved, ()) = tokio::join!(budget.reserve_after(8 * UNIT, own, SOON), work);
+            let (reserved, ()) = tokio::join!(budget.reserve_after(8, own, SOON), work);
             let all = reserved.unwrap();
             let own = tokio::time::sleep(SOON);
-            assert_eq!(budget.reserve_after(8 * UNIT, own, SOON).await.unwrap_err().code(), "busy");
+            assert_eq!(budget.reserve_after(8, own, SOON).await.unwrap_err().code(), "busy");
             drop(all);
         });
     }
@@ -223,12 +384,30 @@ mod tests {
     #[test]
     fn one_who_gives_up_leaves_the_queue() {
         run(async {
-            let budget = Budget::new(10 * UNIT);
-            let held = budget.reserve(6 * UNIT, SOON).await.unwrap();
-            assert!(budget.reserve(8 * UNIT, SOON).await.is_err());
-            let small = budget.reserve(4 * UNIT, SOON).await.unwrap();
+            let budget = Budget::new(10, 5);
+            let held = budget.reserve(6, SOON).await.unwrap();
+            assert!(budget.reserve(8, SOON).await.is_err());
+            let gone = ask(&budget, 10).await;
+            let next = ask(&budget, 5).await;
+            assert_eq!(budget.waiting(), 2);
+            gone.abort();
+            let small = budget.reserve(4, SOON).await.unwrap();
             drop((held, small));
-            assert_eq!(budget.free(), 10 * UNIT);
+            assert_eq!(next.await.unwrap().bytes(), 5);
+            assert_eq!(budget.free(), 10);
+        });
+    }
+
+    #[test]
+    fn a_full_queue_refuses_at_once() {
+        run(async {
+            let budget = Budget::new(10, 1);
+            let held = budget.reserve(10, SOON).await.unwrap();
+            let waiting = ask(&budget, 1).await;
+            let refused = tokio::time::timeout(SOON, budget.reserve(1, LATER)).await.unwrap().unwrap_err();
+            assert!(matches!(refused, AdmissionError::Busy { waited: Duration::ZERO, .. }), "{refused:?}");
+            drop(held);
+            assert_eq!(waiting.await.unwrap().bytes(), 1);
         });
     }
 }

@@ -116,7 +116,7 @@ impl From<ClientError> for Failure {
     fn from(error: ClientError) -> Self {
         let kind = match error {
             ClientError::Refused { .. } => FailureKind::Refused,
-            ClientError::Url(_) => FailureKind::Usage,
+            ClientError::Url(_) | ClientError::Token => FailureKind::Usage,
             ClientError::Stopped => return Stopped.into(),
             _ => FailureKind::Failed,
         };

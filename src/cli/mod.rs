@@ -11,6 +11,7 @@ macro_rules! say {
     };
 }
 
+mod allocator;
 mod args;
 mod cost;
 mod demo;
@@ -25,6 +26,7 @@ mod schedule;
 mod serve;
 mod stability;
 mod synth;
+mod token;
 
 use clap::Parser;
 use failure::{Failure, FailureKind};
@@ -46,7 +48,7 @@ Examples:
   rpfd inspect render.tiles.zst                   what is in a file, and what is wrong with it
   rpfd filter render.tiles.zst -o render.exr      denoise a file
   rpfd report --folder renders --html report.html error against run time, as a page
-  rpfd serve --listen 0.0.0.0:8080                run the service
+  rpfd serve --listen 127.0.0.1:8080              run the service
   rpfd post render.tiles.zst --to http://HOST:8080 -o render.exr
                                                   denoise a file by the service";
 
@@ -61,6 +63,7 @@ enum Command {
     Serve(serve::Args),
     Stability(stability::Args),
     Synth(synth::Args),
+    Token(token::Args),
 }
 
 /// Parses the command line, runs the command, and says how it went.
@@ -75,6 +78,7 @@ pub fn main() -> ExitCode {
         Command::Serve(args) => (false, serve::run(args)),
         Command::Stability(args) => (args.json, stability::run(&args)),
         Command::Synth(args) => (args.json, synth::run(&args)),
+        Command::Token(args) => (false, token::run(&args)),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

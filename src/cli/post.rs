@@ -7,11 +7,13 @@ use super::{
     input::Input,
     progress,
     schedule::cut_tiles,
+    token::read_secret,
 };
 use crate::{
     client::{Client, ClientError, State},
     filter::{Halo, SampleTile, Stopped, TileGeometry, geometry::tiling},
     image::description::channels_to_json,
+    service::auth::check_token,
     stitch::atomic::AtomicFile,
     store::spool::Spool,
     wire::{Format, Header, encode_tile, value::Number},
@@ -48,6 +50,9 @@ pub(crate) struct Args {
     /// EXR to write; it appears when it is whole
     #[arg(short, long, value_name = "OUT.exr")]
     output: PathBuf,
+    /// File with the token that the service wants to see; by default the one in the environment variable RPFD_TOKEN
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
     /// Who brings the context around tiles: client, this command with every tile; neighbors, the tiles around it, so that
     /// every sample is sent once
     #[arg(long, value_name = "WHO", default_value = "client", value_parser = ["client", "neighbors"])]
@@ -82,11 +87,28 @@ Examples:
   rpfd post render.tiles --to http://localhost:8080 -o render.exr --halo neighbors --tile 128
   rpfd post render.tiles --to https://farm.example -o render.exr --preset paper-fast --id shot-12-frame-7";
 
+impl Args {
+    /// The token, which is never on the command line: others may read that.
+    fn token(&self) -> Result<Option<String>, Failure> {
+        let token = match (&self.token_file, std::env::var("RPFD_TOKEN")) {
+            (Some(path), _) => read_secret(path)?,
+            (None, Ok(token)) => {
+                let wrong = |error| Failure::usage("bad_token", format!("RPFD_TOKEN: {error}"));
+                check_token(token.trim()).map_err(wrong)?;
+                token.trim().to_owned()
+            }
+            (None, Err(_)) => return Ok(None),
+        };
+        Ok(Some(token))
+    }
+}
+
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let method = args.method.method()?;
     AtomicFile::create(&args.output)?;
     let stop = progress::interrupted();
-    let client = Client::new(&args.to, args.attempts, stop.clone())?;
+    let token = args.token()?;
+    let client = Client::with_token(&args.to, args.attempts, stop.clone(), token.as_deref())?;
     let input = Input::scan(&args.input)?;
     input.check(None)?;
     let started = Instant::now();

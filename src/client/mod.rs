@@ -16,8 +16,10 @@ use std::{
     time::Duration,
 };
 use ureq::{
-    Agent, Body,
-    http::{Response, header},
+    Agent, Body, SendBody,
+    http::{HeaderValue, Request, Response, header},
+    middleware::MiddlewareNext,
+    tls::{RootCerts, TlsConfig},
 };
 
 /// Most bytes of an answer that is no file.
@@ -56,6 +58,9 @@ pub enum ClientError {
     /// This is no address of a service.
     #[error("{0:?} is no address of a service: it must start with http:// or https://")]
     Url(String),
+    /// The token cannot be one: it has a control character in it.
+    #[error("the token cannot be sent: it has characters that no header may have")]
+    Token,
     /// The answer could not be written down.
     #[error("cannot keep the answer: {0}")]
     Output(io::Error),
@@ -73,6 +78,7 @@ impl ClientError {
             Self::Unreachable { .. } => "unreachable",
             Self::Answer { .. } => "bad_answer",
             Self::Url(_) => "bad_url",
+            Self::Token => "bad_token",
             Self::Output(_) => "output_io",
             Self::Stopped => "interrupted",
         }
@@ -110,6 +116,16 @@ impl Client {
     /// A client of the service at this address, like `http://localhost:8080`. Calls are tried `attempts` times at most
     /// (0 means once), and no more once `stop` is set. Nothing is sent yet.
     pub fn new(base: &str, attempts: u32, stop: Arc<AtomicBool>) -> Result<Self, ClientError> {
+        Self::with_token(base, attempts, stop, None)
+    }
+
+    /// As [`new`](Self::new), with the bearer token that the service wants to see.
+    pub fn with_token(
+        base: &str,
+        attempts: u32,
+        stop: Arc<AtomicBool>,
+        token: Option<&str>,
+    ) -> Result<Self, ClientError> {
         let known = ["http://", "https://"].iter().any(|scheme| base.len() > scheme.len() && base.starts_with(scheme));
         if !known {
             return Err(ClientError::Url(base.to_owned()));
@@ -117,6 +133,8 @@ impl Client {
         // Filtering a tile may take long, and so may waiting for the service's memory; silence between bytes may not.
         let config = Agent::config_builder()
             .http_status_as_error(false)
+            // The certificates that this system trusts; the library itself trusts none.
+            .tls_config(TlsConfig::builder().root_certs(RootCerts::PlatformVerifier).build())
             .user_agent(concat!("rpfd/", env!("CARGO_PKG_VERSION")))
             .timeout_connect(Some(Duration::from_secs(10)))
             .timeout_send_body(Some(Duration::from_secs(600)))
@@ -125,6 +143,17 @@ impl Client {
         // A proxy of the environment's cannot reach what is on this machine.
         let local = ["://127.", "://localhost", "://[::1]"].iter().any(|host| base.contains(host));
         let config = if local { config.proxy(None) } else { config };
+        let config = match token {
+            Some(token) => {
+                let mut value = HeaderValue::try_from(format!("Bearer {token}")).map_err(|_| ClientError::Token)?;
+                value.set_sensitive(true);
+                config.middleware(move |mut request: Request<SendBody>, next: MiddlewareNext| {
+                    request.headers_mut().insert(header::AUTHORIZATION, value.clone());
+                    next.handle(request)
+                })
+            }
+            None => config,
+        };
         let agent = config.build().new_agent();
         let base = base.trim_end_matches('/').to_owned();
         Ok(Self { agent, base, retry: Retry { attempts: attempts.max(1), stop } })

@@ -4,70 +4,58 @@ use std::{
     io,
     pin::Pin,
     task::{Context, Poll},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
-use async_compression::{
-    tokio::bufread::{GzipDecoder, ZstdDecoder},
-    zstd::DParameter,
-};
 use axum::{
-    body::{Body, BodyDataStream},
+    body::{Body, BodyDataStream, HttpBody},
     extract::Request,
     http::{HeaderMap, StatusCode, header},
 };
 use bytes::Bytes;
-use futures_util::{Stream, StreamExt, TryStreamExt};
+use futures_util::{Stream, StreamExt};
 use tokio::{runtime::Handle, time::timeout};
-use tokio_util::io::{ReaderStream, StreamReader};
 
-use super::problem::Refusal;
-use crate::wire::file::MAX_WINDOW_LOG;
+use super::{
+    charge::Charge,
+    inflate::{Inflate, Inflated},
+    pace::{Meter, OpenBodies, OpenBody, Pace},
+    problem::Refusal,
+};
 
-/// Bytes decompressed at a time.
-const BUFFER: usize = 64 << 10;
 /// How long the rest of a body is read, and thrown away, whose request was answered already.
 const LINGER: Duration = Duration::from_secs(10);
 /// How long it may bring nothing before that is given up.
 const LINGER_IDLE: Duration = Duration::from_secs(1);
 
-type Source = Pin<Box<dyn Stream<Item = io::Result<Bytes>> + Send>>;
-
 /// Reads a body. Nothing is read before it is asked for, so a client that says `Expect: 100-continue` is told to go on
 /// only then.
 pub(super) struct Frames {
-    source: Source,
-    idle: Duration,
+    source: BodyDataStream,
+    inflate: Option<Inflate>,
+    /// What came and is not decompressed yet.
+    packed: Bytes,
+    charge: Charge,
+    pace: Pace,
+    meter: Meter,
     ended: bool,
 }
 
-/// The connection failed, not what came over it.
-#[derive(Debug, thiserror::Error)]
-#[error("the request's body was cut off: {0}")]
-struct Cut(axum::Error);
-
 impl Frames {
-    /// Judges the content encoding; `idle` is how long to wait for a frame.
-    pub(super) fn new(headers: &HeaderMap, body: Body, idle: Duration) -> Result<Self, Refusal> {
-        let raw = body.into_data_stream().map_err(|error| io::Error::other(Cut(error)));
+    /// Judges the content encoding. What decompressing takes is added to the request's charge.
+    pub(super) fn new(headers: &HeaderMap, body: Body, charge: Charge, pace: Pace) -> Result<Self, Refusal> {
         let mut encodings = headers
             .get_all(header::CONTENT_ENCODING)
             .into_iter()
             .flat_map(|value| value.to_str().unwrap_or("?").split(','))
             .map(|name| name.trim().to_ascii_lowercase())
             .filter(|name| !name.is_empty() && name != "identity");
-        let source: Source = match (encodings.next().as_deref(), encodings.next()) {
-            (None, _) => Box::pin(raw),
-            (Some("zstd"), None) => {
-                let window = DParameter::window_log_max(MAX_WINDOW_LOG);
-                let mut decoder = ZstdDecoder::with_params(StreamReader::new(raw), &[window]);
-                decoder.multiple_members(true);
-                Box::pin(ReaderStream::with_capacity(decoder, BUFFER))
-            }
+        let inflate = match (encodings.next().as_deref(), encodings.next()) {
+            (None, _) => None,
+            (Some("zstd"), None) => Some(Inflate::zstd()?),
             (Some("gzip" | "x-gzip"), None) => {
-                let mut decoder = GzipDecoder::new(StreamReader::new(raw));
-                decoder.multiple_members(true);
-                Box::pin(ReaderStream::with_capacity(decoder, BUFFER))
+                charge.add_window(0)?;
+                Some(Inflate::gzip())
             }
             _ => {
                 return Err(Refusal::new(
@@ -78,38 +66,78 @@ impl Frames {
                 ));
             }
         };
-        Ok(Self { source, idle, ended: false })
+        let (source, meter) = (body.into_data_stream(), Meter::new(pace));
+        Ok(Self { source, inflate, packed: Bytes::new(), charge, pace, meter, ended: false })
     }
 
-    /// The next bytes, never none; `Ok(None)` at the end of the body.
-    pub(super) async fn next(&mut self) -> Result<Option<Bytes>, Refusal> {
-        while !self.ended {
-            let Ok(frame) = timeout(self.idle, self.source.next()).await else {
-                self.ended = true;
-                return Err(Refusal::new(
-                    StatusCode::REQUEST_TIMEOUT,
-                    "body_timeout",
-                    "The request's body does not come",
-                    format!("nothing came for {} seconds", self.idle.as_secs_f64()),
-                ));
+    /// The next bytes, never none; `Ok(None)` at the end of the body. Between tiles nothing need come for a while;
+    /// elsewhere what comes must not come too slowly.
+    pub(super) async fn next(&mut self, between: bool) -> Result<Option<Bytes>, Refusal> {
+        loop {
+            let inflated = match &mut self.inflate {
+                // What was held is let go of before the next bytes take its place.
+                None => Ok(Some(Inflated::Bytes(std::mem::take(&mut self.packed)))),
+                Some(inflate) => inflate.next(&mut self.packed),
             };
-            match frame {
-                Some(Ok(frame)) if frame.is_empty() => {}
-                Some(Ok(frame)) => return Ok(Some(frame)),
-                Some(Err(error)) => {
-                    self.ended = true;
-                    return Err(fault(&error));
-                }
-                None => self.ended = true,
+            match inflated.map_err(|error| self.fault(&error))? {
+                Some(Inflated::Bytes(bytes)) if !bytes.is_empty() => return Ok(Some(bytes)),
+                Some(Inflated::Window(window)) => self.charge.add_window(window)?,
+                _ if self.ended => return Ok(None),
+                _ => self.read(between).await?,
             }
         }
-        Ok(None)
+    }
+
+    /// Waits for more.
+    async fn read(&mut self, between: bool) -> Result<(), Refusal> {
+        let asked = Instant::now();
+        let frame = timeout(self.pace.idle, self.source.next()).await;
+        let waited = if between { Duration::ZERO } else { asked.elapsed() };
+        match frame {
+            Err(_) => return Err(self.late(format!("nothing came for {} seconds", self.pace.idle.as_secs_f64()))),
+            Ok(Some(Ok(frame))) => {
+                if let Err(slow) = self.meter.add(waited, frame.len() as u64) {
+                    let (bytes, seconds, rate) = (slow.bytes, slow.waited.as_secs_f64(), self.pace.rate);
+                    let detail = format!("{bytes} bytes came in {seconds:.1} seconds: {rate} a second must");
+                    return Err(self.late(detail));
+                }
+                self.packed = frame;
+            }
+            Ok(Some(Err(error))) => {
+                self.ended = true;
+                let (title, detail) = ("The request's body cannot be read", format!("it was cut off: {error}"));
+                return Err(Refusal::new(StatusCode::BAD_REQUEST, "body_cut", title, detail));
+            }
+            Ok(None) => {
+                self.ended = true;
+                if let Some(inflate) = &mut self.inflate {
+                    inflate.finish().map_err(|error| self.fault(&error))?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn late(&mut self, detail: String) -> Refusal {
+        self.ended = true;
+        Refusal::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", "The request's body does not come", detail)
+    }
+
+    /// What to say of compressed data that cannot be read.
+    fn fault(&mut self, error: &io::Error) -> Refusal {
+        self.ended = true;
+        let bad =
+            |code, detail| Refusal::new(StatusCode::BAD_REQUEST, code, "The request's body cannot be read", detail);
+        match error.kind() {
+            io::ErrorKind::UnexpectedEof => bad("truncated", "the compressed data ends too early".to_owned()),
+            _ => bad("compression", format!("the compressed data cannot be read: {error}")),
+        }
     }
 
     /// All of the body, which may have so many bytes.
     pub(super) async fn all(mut self, limit: usize) -> Result<Vec<u8>, Refusal> {
         let mut all = Vec::new();
-        while let Some(frame) = self.next().await? {
+        while let Some(frame) = self.next(false).await? {
             if all.len() + frame.len() > limit {
                 return Err(Refusal::new(
                     StatusCode::PAYLOAD_TOO_LARGE,
@@ -127,14 +155,19 @@ impl Frames {
 /// A body whose rest is read and thrown away, for a while, when it is dropped: a client that still sends would otherwise
 /// see its connection reset, and not the answer. Not so if the client waits for the word to go on, and never got it.
 struct Lingering {
-    inner: Option<BodyDataStream>,
+    /// The body, and the word to the connection that it is open.
+    inner: Option<(BodyDataStream, Option<OpenBody>)>,
     waits: bool,
 }
 
 /// Makes a request's body one that [lingers](Lingering).
 pub(super) async fn linger(request: Request) -> Request {
+    if request.body().is_end_stream() {
+        return request;
+    }
     let waits = request.headers().contains_key(header::EXPECT);
-    request.map(|body| Body::from_stream(Lingering { inner: Some(body.into_data_stream()), waits }))
+    let open = request.extensions().get::<OpenBodies>().map(OpenBodies::open);
+    request.map(|body| Body::from_stream(Lingering { inner: Some((body.into_data_stream(), open)), waits }))
 }
 
 impl Stream for Lingering {
@@ -142,7 +175,7 @@ impl Stream for Lingering {
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         self.waits = false;
-        let Some(inner) = &mut self.inner else { return Poll::Ready(None) };
+        let Some((inner, _)) = &mut self.inner else { return Poll::Ready(None) };
         let polled = inner.poll_next_unpin(context);
         if !matches!(polled, Poll::Pending | Poll::Ready(Some(Ok(_)))) {
             self.inner = None;
@@ -153,39 +186,42 @@ impl Stream for Lingering {
 
 impl Drop for Lingering {
     fn drop(&mut self) {
-        if let (Some(mut inner), false, Ok(runtime)) = (self.inner.take(), self.waits, Handle::try_current()) {
-            let rest = async move { while let Ok(Some(Ok(_))) = timeout(LINGER_IDLE, inner.next()).await {} };
+        if let (Some((mut inner, open)), false, Ok(runtime)) = (self.inner.take(), self.waits, Handle::try_current()) {
+            let rest = async move {
+                while let Ok(Some(Ok(_))) = timeout(LINGER_IDLE, inner.next()).await {}
+                drop(open);
+            };
             runtime.spawn(timeout(LINGER, rest));
         }
-    }
-}
-
-/// What to say of a body that cannot be read.
-fn fault(error: &io::Error) -> Refusal {
-    let bad = |code, detail| Refusal::new(StatusCode::BAD_REQUEST, code, "The request's body cannot be read", detail);
-    match error.get_ref() {
-        Some(inner) if inner.is::<Cut>() => bad("body_cut", error.to_string()),
-        _ if error.kind() == io::ErrorKind::UnexpectedEof => {
-            bad("truncated", "the compressed data ends too early".to_owned())
-        }
-        _ => bad("compression", format!("the compressed data cannot be read: {error}")),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{
+        admission::Budget,
+        service::{charge::REQUEST, inflate::OVERHEAD},
+        wire::file::MAX_WINDOW_LOG,
+    };
 
-    fn frames(encoding: Option<&str>, body: Vec<u8>) -> Result<Frames, Refusal> {
+    const PACE: Pace = Pace { idle: Duration::from_secs(5), rate: 1 };
+
+    /// What a body comes to, by a request for which there is so much memory; or the code of the problem.
+    fn read(encoding: Option<&str>, body: Body, memory: u64, pace: Pace) -> Result<Vec<u8>, String> {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
         let mut headers = HeaderMap::new();
         encoding.map(|encoding| headers.insert(header::CONTENT_ENCODING, encoding.parse().unwrap()));
-        Frames::new(&headers, Body::from(body), Duration::from_secs(5))
+        runtime.block_on(async {
+            let permit = Budget::new(memory, 1).reserve(REQUEST, PACE.idle).await.unwrap();
+            let frames = Frames::new(&headers, body, Charge::new(permit), pace);
+            let code = |refusal: Refusal| refusal.0.code;
+            frames.map_err(code)?.all(100_000).await.map_err(code)
+        })
     }
 
     fn all(encoding: Option<&str>, body: Vec<u8>) -> Result<Vec<u8>, String> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
-        let code = |refusal: Refusal| refusal.0.code;
-        runtime.block_on(async { frames(encoding, body).map_err(code)?.all(100_000).await.map_err(code) })
+        read(encoding, Body::from(body), 1 << 30, PACE)
     }
 
     #[test]
@@ -207,17 +243,39 @@ mod tests {
         assert_eq!(all(None, [&data[..], b"1"].concat()).unwrap_err(), "body_too_large");
     }
 
+    /// A small body whose window is large.
+    fn packed(log: u32) -> Vec<u8> {
+        let mut encoder = zstd::Encoder::new(Vec::new(), 1).unwrap();
+        encoder.window_log(log).unwrap();
+        encoder.include_contentsize(false).unwrap();
+        io::Write::write_all(&mut encoder, b"small").unwrap();
+        io::Write::flush(&mut encoder).unwrap();
+        encoder.finish().unwrap()
+    }
+
     #[test]
     fn a_window_beyond_the_limit_is_refused() {
-        let packed = |log: u32| {
-            let mut encoder = zstd::Encoder::new(Vec::new(), 1).unwrap();
-            encoder.window_log(log).unwrap();
-            encoder.include_contentsize(false).unwrap();
-            io::Write::write_all(&mut encoder, b"small").unwrap();
-            io::Write::flush(&mut encoder).unwrap();
-            encoder.finish().unwrap()
-        };
         assert_eq!(all(Some("zstd"), packed(MAX_WINDOW_LOG)), Ok(b"small".to_vec()));
         assert_eq!(all(Some("zstd"), packed(MAX_WINDOW_LOG + 1)).unwrap_err(), "compression");
+    }
+
+    #[test]
+    fn a_window_beyond_the_memory_is_refused() {
+        let memory = REQUEST + OVERHEAD + (8 << 20);
+        // A later frame may have a wider window than the first.
+        let two = |log| [packed(20), packed(log)].concat();
+        assert_eq!(read(Some("zstd"), two(23).into(), memory, PACE), Ok(b"smallsmall".to_vec()));
+        assert_eq!(read(Some("zstd"), two(23).into(), memory - 1, PACE).unwrap_err(), "over_memory");
+    }
+
+    #[test]
+    fn a_trickle_is_given_up() {
+        // Something comes often enough, but 50 seconds of it would not be 10 kB.
+        let pace = Pace { idle: Duration::from_millis(100), rate: 100_000 };
+        let trickle = futures_util::stream::unfold((), async |()| {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            Some((Ok::<_, io::Error>(Bytes::from_static(b"x")), ()))
+        });
+        assert_eq!(read(None, Body::from_stream(trickle), 1 << 20, pace).unwrap_err(), "body_timeout");
     }
 }

@@ -21,9 +21,10 @@ use serde_json::{Value, json};
 use super::{
     Shared,
     body::Frames,
+    charge::Charge,
     picture::{encode_png, write_file},
     problem::{Refusal, corners},
-    query::{Form, Parameters, attributes},
+    query::{Form, NoQuery, Parameters, attributes},
     regions,
     registry::{Id, Opened, no_image},
     results::file_response,
@@ -310,10 +311,10 @@ fn announced(parameters: &mut Parameters) -> Result<Announced, Refusal> {
 }
 
 /// `POST /v1/images`.
-pub(super) async fn open(State(service): State<Shared>, request: Request) -> Result<Response, Refusal> {
+pub(super) async fn open(State(service): State<Shared>, charge: Charge, request: Request) -> Result<Response, Refusal> {
     Parameters::of_query(request.uri())?.done("none: an image is described in the body")?;
     let (parts, body) = request.into_parts();
-    let body = Frames::new(&parts.headers, body, service.config.idle_deadline)?.all(MAX_JSON).await?;
+    let body = Frames::new(&parts.headers, body, charge, service.pace())?.all(MAX_JSON).await?;
     let (status, id, summary) = blocking(move || {
         let (id, description) = described(&body, &service)?;
         let (new, opened) = service.images.open(id, description)?;
@@ -327,13 +328,13 @@ pub(super) async fn open(State(service): State<Shared>, request: Request) -> Res
 }
 
 /// `GET /v1/images`.
-pub(super) async fn list(State(service): State<Shared>) -> Result<Json<Value>, Refusal> {
+pub(super) async fn list(State(service): State<Shared>, _: NoQuery) -> Result<Json<Value>, Refusal> {
     let list = blocking(move || service.images.list()).await?;
     Ok(Json(json!({ "images": list })))
 }
 
 /// `GET /v1/images/{id}`.
-pub(super) async fn status(State(service): State<Shared>, id: Id) -> Result<Response, Refusal> {
+pub(super) async fn status(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<Response, Refusal> {
     let file = blocking(move || {
         let opened = service.images.find(&id)?;
         opened.image.flush()?;
@@ -343,7 +344,7 @@ pub(super) async fn status(State(service): State<Shared>, id: Id) -> Result<Resp
 }
 
 /// `DELETE /v1/images/{id}`.
-pub(super) async fn delete(State(service): State<Shared>, id: Id) -> Result<StatusCode, Refusal> {
+pub(super) async fn delete(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<StatusCode, Refusal> {
     let name = id.clone();
     let removed = blocking(move || service.images.delete(&name)).await??;
     if !removed {
@@ -354,7 +355,7 @@ pub(super) async fn delete(State(service): State<Shared>, id: Id) -> Result<Stat
 }
 
 /// `POST /v1/images/{id}/finish`.
-pub(super) async fn finish(State(service): State<Shared>, id: Id) -> Result<Response, Refusal> {
+pub(super) async fn finish(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<Response, Refusal> {
     let (settled, summary) = blocking(move || {
         let opened = service.images.find(&id)?;
         opened.image.finish()?;

@@ -1,14 +1,23 @@
 //! The service: tiles in, results and stitched images out, over HTTP. `proto/tile.md` says what it answers.
 //!
-//! One tile goes one way: `body` decompresses frames, `receive` decodes them as they come, after it has reserved the
-//! tile's memory; `stream` hands it to `work`, the pool of threads, and writes what comes out to `results`, a file that
-//! the client reads from, or to the canvas of one of the `images`.
+//! One tile goes one way: `body` reads frames, which `inflate` decompresses, and `receive` decodes them as they come, after
+//! it has reserved the tile's memory; `stream` hands it to `work`, the pool of threads, and writes what comes out to
+//! `results`, a file that the client reads from, or to the canvas of one of the `images`. What a request takes beside its
+//! tiles is a `charge`, and `pace` says how slow its client may be.
 //!
 //! Threads that serve connections never wait for the disk or for the filter.
 
+pub mod auth;
 mod body;
+mod charge;
+mod connection;
+mod health;
 mod images;
+mod inflate;
+mod metrics;
+mod openapi;
 mod opened;
+mod pace;
 mod picture;
 mod problem;
 mod query;
@@ -18,6 +27,7 @@ mod registry;
 mod results;
 mod routes;
 mod stream;
+mod trace;
 mod work;
 
 use std::{
@@ -25,28 +35,27 @@ use std::{
     net::{SocketAddr, TcpListener},
     path::PathBuf,
     pin::pin,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::Arc,
     time::Duration,
 };
 
 use axum::Router;
-use hyper::server::conn::http1;
-use hyper_util::{
-    rt::{TokioIo, TokioTimer},
-    service::TowerToHyperService,
-};
-use tokio::{net::TcpStream, sync::watch, task::JoinSet, time::timeout};
+use tokio::{sync::watch, task::JoinSet, time::timeout};
 
 use crate::{
     admission::Budget,
     config::{Config, ConfigError},
 };
+use auth::{Auth, TokensError};
+use connection::Limits;
+use health::{Readiness, Reason};
+use metrics::{Counted, Metrics};
+use pace::Pace;
 use registry::{Images, StartError};
 use work::Work;
 
+/// Connections at once to the address for metrics.
+const METRICS_CONNECTIONS: usize = 16;
 /// How often images that nobody uses are looked for.
 const TIDY: Duration = Duration::from_secs(30);
 
@@ -57,6 +66,9 @@ pub enum ServeError {
     /// The configuration is wrong.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// The file of tokens is wrong.
+    #[error(transparent)]
+    Tokens(#[from] TokensError),
     /// The address cannot be listened on.
     #[error("cannot listen on {address}: {source}")]
     Listen {
@@ -89,6 +101,7 @@ impl ServeError {
     pub const fn code(&self) -> &'static str {
         match self {
             Self::Config(_) => "bad_config",
+            Self::Tokens(_) => "bad_tokens",
             Self::Listen { .. } => "listen",
             Self::DataDir { .. } => "data_dir",
             Self::InUse { .. } => "data_dir_in_use",
@@ -100,11 +113,24 @@ impl ServeError {
 /// What all requests share.
 struct Inner {
     config: Config,
+    /// Memory for tiles.
     budget: Budget,
+    /// Memory for requests.
+    requests: Budget,
+    /// Disk for results that nobody has read yet.
+    unread: Budget,
     work: Work,
     images: Images,
-    /// Whether the service was told to stop.
-    draining: AtomicBool,
+    auth: Auth,
+    metrics: Metrics,
+    readiness: Readiness,
+}
+
+impl Inner {
+    /// How slow a client may be.
+    const fn pace(&self) -> Pace {
+        Pace { idle: self.config.idle_deadline, rate: self.config.min_rate.0 }
+    }
 }
 
 type Shared = Arc<Inner>;
@@ -113,28 +139,51 @@ type Shared = Arc<Inner>;
 pub struct Service {
     listener: TcpListener,
     address: SocketAddr,
+    metrics: Option<(TcpListener, SocketAddr)>,
     inner: Shared,
 }
 
+/// Reads the tokens again, while the service runs.
+#[derive(Clone)]
+pub struct Reload(Shared);
+
+impl Reload {
+    /// Reads the file of tokens and says how many there are. If anything is wrong with it, all stays as it was. Blocks.
+    pub fn tokens(&self) -> Result<usize, TokensError> {
+        self.0.auth.reload()
+    }
+}
+
+/// Takes an address, and says which it got.
+fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
+    let failed = |source| ServeError::Listen { address, source };
+    let listener = TcpListener::bind(address).map_err(failed)?;
+    listener.set_nonblocking(true).map_err(failed)?;
+    let address = listener.local_addr().map_err(failed)?;
+    Ok((listener, address))
+}
+
 impl Service {
-    /// Checks the configuration and the data folder, starts the threads, and takes the address.
+    /// Checks the configuration, the tokens and the data folder, starts the threads, and takes the addresses.
     pub fn bind(config: Config) -> Result<Self, ServeError> {
         config.validate()?;
+        let auth = Auth::new(&config)?;
         let data_dir = |source| ServeError::DataDir { path: config.data_dir.clone(), source };
         std::fs::create_dir_all(&config.data_dir).map_err(data_dir)?;
         tempfile::tempfile_in(&config.data_dir).map_err(data_dir)?;
-        let work = Work::new(config.threads)?;
-        let listen = |source| ServeError::Listen { address: config.listen, source };
-        let listener = TcpListener::bind(config.listen).map_err(listen)?;
-        listener.set_nonblocking(true).map_err(listen)?;
-        let address = listener.local_addr().map_err(listen)?;
+        let work = Work::new(config.threads, config.work_deadline)?;
+        let (listener, address) = listen(config.listen)?;
+        let metrics = config.metrics_listen.map(listen).transpose()?;
+        let share = charge::share(config.memory.0);
+        let [budget, requests, unread] =
+            [config.memory.0 - share, share, config.unread_results.0].map(|bytes| Budget::new(bytes, config.queue));
         let images = Images::start(&config).map_err(|error| match error {
             StartError::InUse => ServeError::InUse { path: config.data_dir.clone() },
             StartError::Io(source) => data_dir(source),
         })?;
-        let budget = Budget::new(config.memory.0);
-        let inner = Arc::new(Inner { config, budget, work, images, draining: AtomicBool::new(false) });
-        Ok(Self { listener, address, inner })
+        let (counts, readiness) = (Metrics::new(), Readiness::default());
+        let inner = Inner { config, budget, requests, unread, work, images, auth, metrics: counts, readiness };
+        Ok(Self { listener, address, metrics, inner: Arc::new(inner) })
     }
 
     /// The address it listens on, with the port that it got.
@@ -142,39 +191,43 @@ impl Service {
         self.address
     }
 
+    /// The address of the metrics, with the port that it got.
+    pub fn metrics_addr(&self) -> Option<SocketAddr> {
+        self.metrics.as_ref().map(|(_, address)| *address)
+    }
+
+    /// What reads the tokens again.
+    pub fn reload(&self) -> Reload {
+        Reload(Arc::clone(&self.inner))
+    }
+
     /// Answers requests until `shutdown` is done, and then finishes those that were begun, within the deadline of the
     /// configuration. Needs a tokio runtime with I/O and time.
     pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<(), ServeError> {
-        let Self { listener, address, inner } = self;
+        let Self { listener, address, metrics, inner } = self;
         let failed = |source| ServeError::Listen { address, source };
         let listener = tokio::net::TcpListener::from_std(listener).map_err(failed)?;
-        let router = routes::router(Arc::clone(&inner));
         let (stop, stopping) = watch::channel(false);
         let mut connections = JoinSet::new();
-        let mut shutdown = pin!(shutdown);
+        // Metrics are served to the very end, stopping or not.
+        let (_never, serving) = watch::channel(false);
+        let mut beside = JoinSet::new();
+        if let Some((listener, _)) = metrics {
+            let listener = tokio::net::TcpListener::from_std(listener).map_err(failed)?;
+            let (router, inner) = (routes::metrics_router(Arc::clone(&inner)), Arc::clone(&inner));
+            beside.spawn(async move {
+                let (mut connections, never) = (JoinSet::new(), std::future::pending());
+                accept(&listener, &router, &serving, &inner, METRICS_CONNECTIONS, &mut connections, never).await;
+            });
+        }
         inner.images.resume(&inner);
         let tidying = tokio::spawn(tidy(Arc::clone(&inner)));
-        tracing::info!(%address, memory = %inner.config.memory, threads = inner.config.threads, simd = inner.config.simd.name(), "listening");
-        loop {
-            let room = connections.len() < inner.config.connections;
-            tokio::select! {
-                () = &mut shutdown => break,
-                Some(_) = connections.join_next() => {}
-                accepted = listener.accept(), if room => match accepted {
-                    Ok((stream, _)) => {
-                        let deadline = inner.config.header_deadline;
-                        connections.spawn(serve(stream, router.clone(), stopping.clone(), deadline));
-                    }
-                    // Out of file handles, say: others will close theirs.
-                    Err(error) => {
-                        tracing::warn!(%error, "cannot accept a connection");
-                        tokio::time::sleep(Duration::from_millis(50)).await;
-                    }
-                },
-            }
-        }
+        let router = routes::router(Arc::clone(&inner));
+        let (config, simd) = (&inner.config, inner.config.simd.name());
+        tracing::info!(%address, memory = %config.memory, threads = config.threads, simd, "listening");
+        accept(&listener, &router, &stopping, &inner, inner.config.connections, &mut connections, shutdown).await;
+        inner.readiness.set(Reason::Draining, true);
         drop(listener);
-        inner.draining.store(true, Ordering::Relaxed);
         stop.send_replace(true);
         tracing::info!(connections = connections.len(), "stopping");
         let all = async { while connections.join_next().await.is_some() {} };
@@ -198,28 +251,39 @@ async fn tidy(inner: Shared) {
     }
 }
 
-/// Serves one connection until it ends; after the signal to stop only the request that has begun.
-async fn serve(stream: TcpStream, router: Router, mut stopping: watch::Receiver<bool>, header_deadline: Duration) {
-    // Small answers should not wait for more.
-    let _ = stream.set_nodelay(true);
-    let connection = http1::Builder::new()
-        .timer(TokioTimer::new())
-        .header_read_timeout(header_deadline)
-        .serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
-    let mut connection = pin!(connection);
-    let stopped = async { stopping.wait_for(|&stop| stop).await.is_ok() };
-    let result = tokio::select! {
-        result = connection.as_mut() => Some(result),
-        _ = stopped => None,
-    };
-    let result = match result {
-        Some(result) => result,
-        None => {
-            connection.as_mut().graceful_shutdown();
-            connection.await
+/// Serves connections, so many at once, until `shutdown` is done.
+async fn accept(
+    listener: &tokio::net::TcpListener,
+    router: &Router,
+    stopping: &watch::Receiver<bool>,
+    inner: &Shared,
+    limit: usize,
+    connections: &mut JoinSet<()>,
+    shutdown: impl Future<Output = ()>,
+) {
+    let mut shutdown = pin!(shutdown);
+    let limits =
+        Limits { header_deadline: inner.config.header_deadline, streams: inner.config.streams, pace: inner.pace() };
+    loop {
+        let room = connections.len() < limit;
+        tokio::select! {
+            () = &mut shutdown => return,
+            Some(_) = connections.join_next() => {}
+            accepted = listener.accept(), if room => match accepted {
+                Ok((stream, _)) => {
+                    let counted = Counted::new(&inner.metrics.connections);
+                    let served = connection::serve(stream, router.clone(), stopping.clone(), limits);
+                    connections.spawn(async move {
+                        served.await;
+                        drop(counted);
+                    });
+                }
+                // Out of file handles, say: others will close theirs.
+                Err(error) => {
+                    tracing::warn!(%error, "cannot accept a connection");
+                    tokio::time::sleep(Duration::from_millis(50)).await;
+                }
+            },
         }
-    };
-    if let Err(error) = result {
-        tracing::debug!(%error, "connection failed");
     }
 }

@@ -1,6 +1,7 @@
 //! What went wrong, as an answer: RFC 9457 problems with stable codes.
 
 use axum::{
+    body::Body,
     http::{HeaderValue, StatusCode, header},
     response::{IntoResponse, Response},
 };
@@ -13,6 +14,9 @@ use crate::{
     stitch::{ExrError, StitchError},
     wire::{Problem, WireError},
 };
+
+/// Most seconds after which a client is asked to come again.
+const MAX_RETRY_AFTER: f64 = 600.0;
 
 /// An answer that is not what was asked for.
 #[derive(Debug)]
@@ -30,16 +34,38 @@ impl Refusal {
     }
 }
 
+/// The problem that an answer is, beside it, for whoever passes it on.
+#[derive(Clone, Debug)]
+pub(super) struct Said(pub(super) Box<Problem>);
+
+impl Said {
+    /// The answer, which says too which request it is about.
+    pub(super) fn with_request_id(self, id: &str, mut answer: Response) -> Response {
+        answer.headers_mut().remove(header::CONTENT_LENGTH);
+        answer.map(|_| Body::from(json(&self.0.with("request_id", id))))
+    }
+}
+
+/// A problem is strings and numbers, which always can be written.
+fn json(problem: &Problem) -> Vec<u8> {
+    serde_json::to_vec(problem).unwrap_or_default()
+}
+
 impl IntoResponse for Refusal {
     fn into_response(self) -> Response {
         let status = StatusCode::from_u16(self.0.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
-        // A problem is strings and numbers, which always can be written.
-        let body = serde_json::to_vec(&self.0).unwrap_or_default();
         let kind = HeaderValue::from_static("application/problem+json");
-        let mut response = (status, [(header::CONTENT_TYPE, kind)], body).into_response();
+        let mut response = (status, [(header::CONTENT_TYPE, kind)], json(&self.0)).into_response();
+        if status == StatusCode::UNAUTHORIZED {
+            let known = if self.0.code == "missing_token" { "" } else { ", error=\"invalid_token\"" };
+            if let Ok(value) = HeaderValue::try_from(format!("Bearer realm=\"rpfd\"{known}")) {
+                response.headers_mut().insert(header::WWW_AUTHENTICATE, value);
+            }
+        }
         if let Some(seconds) = self.0.more.get("retry_after").and_then(serde_json::Value::as_u64) {
             response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
         }
+        response.extensions_mut().insert(Said(self.0));
         response
     }
 }
@@ -110,11 +136,11 @@ impl From<AdmissionError> for Problem {
                     .with("needed", needed)
                     .with("available", total)
             }
-            // Who waited in vain for so long may as well wait that long again.
-            AdmissionError::Busy { needed, deadline } => {
+            AdmissionError::Busy { needed, retry_after, .. } => {
+                let seconds = retry_after.as_secs_f64().ceil().min(MAX_RETRY_AFTER) as u64;
                 Self::new(503, error.code(), "The service's memory is in use", detail)
                     .with("needed", needed)
-                    .with("retry_after", deadline.as_secs().clamp(1, 60))
+                    .with("retry_after", seconds.max(1))
             }
         }
     }
@@ -187,12 +213,14 @@ mod tests {
 
     #[test]
     fn an_answer_is_problem_json_and_says_when_to_come_again() {
-        let deadline = std::time::Duration::from_millis(200);
-        let refusal = Refusal::from(AdmissionError::Busy { needed: 5, deadline });
-        let response = refusal.into_response();
-        assert_eq!(response.status(), 503);
-        assert_eq!(response.headers()["content-type"], "application/problem+json");
-        assert_eq!(response.headers()["retry-after"], "1");
+        for (millis, seconds) in [(0, "1"), (1000, "1"), (1001, "2"), (90_000, "90"), (9_999_999_999, "600")] {
+            let [waited, retry_after] = [200, millis].map(std::time::Duration::from_millis);
+            let refusal = Refusal::from(AdmissionError::Busy { needed: 5, waited, retry_after });
+            let response = refusal.into_response();
+            assert_eq!(response.status(), 503);
+            assert_eq!(response.headers()["content-type"], "application/problem+json");
+            assert_eq!(response.headers()["retry-after"], seconds);
+        }
     }
 
     #[test]

@@ -1,16 +1,23 @@
 //! What a request asks for: how to filter, in which form to answer.
 
-use std::collections::BTreeMap;
+use std::{
+    collections::{BTreeMap, btree_map::Entry},
+    fmt,
+};
 
 use axum::{
-    extract::Query,
-    http::{HeaderMap, StatusCode, Uri, header},
+    extract::{FromRequestParts, Query},
+    http::{HeaderMap, StatusCode, Uri, header, request::Parts},
+};
+use serde::{
+    Deserialize, Deserializer,
+    de::{MapAccess, Visitor},
 };
 use serde_json::Value;
 
 use super::problem::Refusal;
 use crate::{
-    filter::{Method, method::DEFAULT_PRESET},
+    filter::{Method, ParameterError, method::DEFAULT_PRESET},
     stitch::{
         ExrOptions,
         exr::{ExrCompression, ExrLayout, ExrSamples, provenance},
@@ -29,6 +36,56 @@ fn bad_parameter(name: &str, value: &str, right: &str) -> Refusal {
 #[derive(Debug)]
 pub(super) struct Parameters(BTreeMap<String, String>, Option<Value>);
 
+/// The pairs of a JSON object as they stand there.
+struct Object(Vec<(String, Value)>);
+
+impl<'de> Deserialize<'de> for Object {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Pairs;
+        impl<'de> Visitor<'de> for Pairs {
+            type Value = Object;
+
+            fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+                f.write_str("an object")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Object, A::Error> {
+                let mut pairs = Vec::new();
+                while let Some(pair) = map.next_entry()? {
+                    pairs.push(pair);
+                }
+                Ok(Object(pairs))
+            }
+        }
+        deserializer.deserialize_map(Pairs)
+    }
+}
+
+fn add(all: &mut BTreeMap<String, String>, name: String, value: String) -> Result<(), Refusal> {
+    match all.entry(name) {
+        Entry::Vacant(entry) => {
+            entry.insert(value);
+            Ok(())
+        }
+        Entry::Occupied(entry) => {
+            let detail = format!("{:?} occurs twice: each may occur once", entry.key());
+            Err(refuse("duplicate_parameter", detail))
+        }
+    }
+}
+
+/// For calls that take no parameters.
+pub(super) struct NoQuery;
+
+impl<S: Sync> FromRequestParts<S> for NoQuery {
+    type Rejection = Refusal;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Refusal> {
+        Parameters::of_query(&parts.uri)?.done("none")?;
+        Ok(Self)
+    }
+}
+
 impl Parameters {
     /// Of a query. A name may occur once.
     pub(super) fn of_query(uri: &Uri) -> Result<Self, Refusal> {
@@ -36,29 +93,29 @@ impl Parameters {
             .map_err(|error| refuse("bad_query", format!("the query cannot be read: {error}")))?;
         let mut all = BTreeMap::new();
         for (name, value) in pairs.0 {
-            if all.contains_key(&name) {
-                return Err(refuse("duplicate_parameter", format!("{name:?} occurs twice: each may occur once")));
-            }
-            all.insert(name, value);
+            add(&mut all, name, value)?;
         }
         Ok(Self(all, None))
     }
 
-    /// Of a JSON object: numbers, texts, bools, and lists of these. Its `channels` may be anything.
+    /// Of a JSON object: numbers, texts, bools, and lists of these. A name may occur once. Its `channels` may be anything.
     pub(super) fn of_json(body: &[u8]) -> Result<Self, Refusal> {
-        let value: Value = serde_json::from_slice(body)
-            .map_err(|error| refuse("bad_json", format!("the body is not the JSON that it should be: {error}")))?;
-        let Value::Object(mut object) = value else {
-            return Err(refuse("bad_json", "the body must be a JSON object".to_owned()));
-        };
-        let mut all = BTreeMap::new();
-        let channels = object.remove("channels");
-        for (name, value) in object {
+        let object: Object = serde_json::from_slice(body).map_err(|error| {
+            refuse("bad_json", format!("the body is not the JSON object that it should be: {error}"))
+        })?;
+        let (mut all, mut channels) = (BTreeMap::new(), None);
+        for (name, value) in object.0 {
+            if name == "channels" {
+                if channels.replace(value).is_some() {
+                    return Err(refuse("duplicate_parameter", format!("{name:?} occurs twice: each may occur once")));
+                }
+                continue;
+            }
             let Some(words) = words(&value, true) else {
                 let right = "must be a number, a text, true or false, or a list of them";
                 return Err(bad_parameter(&name, &value.to_string(), right));
             };
-            all.insert(name, words);
+            add(&mut all, name, words)?;
         }
         Ok(Self(all, channels))
     }
@@ -115,7 +172,15 @@ impl Parameters {
         }
         let preset = self.take("preset").unwrap_or_else(|| DEFAULT_PRESET.to_owned());
         let seed = self.number("seed")?.unwrap_or(0);
-        Ok((Method::with(&preset, self.0)?, seed))
+        let method = Method::with(&preset, self.0).map_err(|error| {
+            let unknown = matches!(error, ParameterError::Name { .. });
+            let mut refusal = Refusal::from(error);
+            if unknown {
+                refusal.0.detail += "; beside these there are preset, seed and leave_out";
+            }
+            refusal
+        })?;
+        Ok((method, seed))
     }
 
     /// Takes out everything that is left: what an EXR is to be like.
@@ -184,41 +249,63 @@ impl Form {
         }
     }
 
+    /// In order of preference, where the client has none.
+    const ALL: [Self; 3] = [Self::Messages, Self::Exr, Self::Png];
+
+    /// How closely a media range of `Accept` describes this form, if it does: 1 for any, 2 for the type, 3 for itself.
+    fn matched(self, range: &str) -> Option<u8> {
+        let (kind, names): (_, &[&str]) = match self {
+            Self::Messages => {
+                ("application/*", &["application/msgpack", "application/x-msgpack", "application/vnd.msgpack"])
+            }
+            Self::Exr => ("image/*", &["image/x-exr", "image/aces"]),
+            Self::Png => ("image/*", &["image/png"]),
+        };
+        match range {
+            "*/*" => Some(1),
+            range if range == kind => Some(2),
+            range => names.contains(&range).then_some(3),
+        }
+    }
+
     /// The form that the client likes best; result streams if it does not say.
     pub(super) fn accepted(headers: &HeaderMap) -> Result<Self, Refusal> {
-        let mut best: Option<(f32, Self)> = None;
-        let mut asked = false;
-        for value in headers.get_all(header::ACCEPT) {
-            let ranges = value.to_str().unwrap_or("?").split(',').map(str::trim).filter(|range| !range.is_empty());
-            for range in ranges {
-                asked = true;
-                let mut parts = range.split(';').map(str::trim);
-                let form = match parts.next().unwrap_or_default().to_ascii_lowercase().as_str() {
-                    "*/*"
-                    | "application/*"
-                    | "application/msgpack"
-                    | "application/x-msgpack"
-                    | "application/vnd.msgpack" => Self::Messages,
-                    "image/*" | "image/x-exr" | "image/aces" => Self::Exr,
-                    "image/png" => Self::Png,
-                    _ => continue,
-                };
-                let quality = parts.find_map(|p| p.strip_prefix("q=")).and_then(|q| q.parse().ok()).unwrap_or(1.0);
-                if quality > best.map_or(0.0, |(quality, _)| quality) {
-                    best = Some((quality, form));
-                }
+        let values = headers.get_all(header::ACCEPT).into_iter();
+        let text: Vec<_> = values.map(|value| value.to_str().unwrap_or("?").to_ascii_lowercase()).collect();
+        let ranges = text.iter().flat_map(|value| value.split(',')).map(str::trim).filter(|range| !range.is_empty());
+        let ranges: Vec<(&str, f32)> = ranges
+            .map(|range| {
+                let (range, parameters) = range.split_once(';').unwrap_or((range, ""));
+                let quality = parameters.split(';').find_map(|p| p.trim().strip_prefix("q="));
+                (range.trim_end(), quality.map_or(1.0, |quality| quality.trim().parse().unwrap_or(0.0)))
+            })
+            .collect();
+        if ranges.is_empty() {
+            return Ok(Self::Messages);
+        }
+        // What is said of a form most closely decides on it; of equals the first that was said.
+        let mut best: Option<(f32, usize, Self)> = None;
+        for form in Self::ALL {
+            let said = ranges.iter().enumerate().filter_map(|(at, (range, quality))| {
+                form.matched(range).map(|closeness| (closeness, std::cmp::Reverse(at), *quality))
+            });
+            let Some((_, std::cmp::Reverse(at), quality)) = said.max_by_key(|(closeness, at, _)| (*closeness, *at))
+            else {
+                continue;
+            };
+            let better = best.is_none_or(|(other, place, _)| quality > other || (quality == other && at < place));
+            if quality > 0.0 && better {
+                best = Some((quality, at, form));
             }
         }
-        match best {
-            Some((_, form)) => Ok(form),
-            None if !asked => Ok(Self::Messages),
-            None => Err(Refusal::new(
+        best.map(|(_, _, form)| form).ok_or_else(|| {
+            Refusal::new(
                 StatusCode::NOT_ACCEPTABLE,
                 "not_acceptable",
                 "There is no such form of the answer",
                 "this answers in application/msgpack, image/x-exr or image/png",
-            )),
-        }
+            )
+        })
     }
 }
 
@@ -264,6 +351,8 @@ mod tests {
         let json = |text: &str| code(Parameters::of_json(text.as_bytes()).and_then(Parameters::method));
         assert_eq!(json("{"), "bad_json");
         assert_eq!(json("[]"), "bad_json");
+        assert_eq!(json(r#"{"seed": 1} x"#), "bad_json");
+        assert_eq!(json(r#"{"seed": 1, "bins": 9, "seed": 1}"#), "duplicate_parameter");
         assert_eq!(json(r#"{"boxes": [[9], 5]}"#), "bad_parameter");
         assert_eq!(json(r#"{"seed": null}"#), "bad_parameter");
         assert_eq!(json(r#"{"seed": 1.5}"#), "bad_parameter");
@@ -294,5 +383,11 @@ mod tests {
         assert_eq!(form("text/html, image/png;q=0.5, image/x-exr; q=0.8"), Some(Form::Exr));
         assert_eq!(form("text/html"), None);
         assert_eq!(form("image/png;q=0"), None);
+        assert_eq!(form("image/png;q=0, image/*"), Some(Form::Exr));
+        assert_eq!(form("*/*, application/msgpack;q=0"), Some(Form::Exr));
+        assert_eq!(form("*/*;q=0.1, Image/PNG; v=1; Q=0.2, application/*;q=0"), Some(Form::Png));
+        assert_eq!(form("image/*;q=0.5, image/x-exr;q=0.4"), Some(Form::Png));
+        assert_eq!(form("image/png, application/msgpack"), Some(Form::Png));
+        assert_eq!(form("image/png;q=nan, image/aces;q=x"), None);
     }
 }

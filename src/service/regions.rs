@@ -117,12 +117,12 @@ async fn drain(service: &Shared, opened: &Opened) -> Result<(), Refusal> {
                             return Err(error.into());
                         }
                     };
-                    let done = service.work.run(move |pool| {
+                    let done = service.work.run(move |pool, _| {
                         let done = image.run(&job, pool);
                         drop(permit);
-                        done
+                        Ok(done?)
                     });
-                    Ok(done.await??)
+                    done.await
                 });
             }
             None if jobs.is_empty() => return failed.map_or(Ok(()), Err),

@@ -234,6 +234,11 @@ impl Images {
         self.all.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// How many there are.
+    pub(super) fn count(&self) -> usize {
+        self.lock().len()
+    }
+
     pub(super) fn entries(&self) -> Vec<Arc<Entry>> {
         self.lock().values().cloned().collect()
     }

@@ -1,43 +1,40 @@
 //! Which call goes where.
 
-use std::{sync::atomic::Ordering, time::Instant};
-
 use axum::{
     Router,
-    extract::{Request, State},
     http::{Method, StatusCode, Uri},
-    middleware::{Next, from_fn, map_request},
-    response::Response,
-    routing::{get, post},
+    middleware::{from_fn_with_state, map_request},
+    routing::get,
 };
 
-use super::{Shared, body, images, problem::Refusal, stream};
+use super::{Shared, auth, body, charge, metrics, openapi, problem::Refusal, trace};
 
 pub(super) fn router(service: Shared) -> Router {
-    Router::new()
-        // PUT as well: `curl -T` sends nothing else.
-        .route("/v1/filter", post(stream::filter_stream).put(stream::filter_stream))
-        .route("/v1/images", post(images::open).get(images::list))
-        .route("/v1/images/{id}", get(images::status).delete(images::delete))
-        .route("/v1/images/{id}/finish", post(images::finish))
-        .route("/v1/images/{id}/tiles", post(stream::image_tiles).put(stream::image_tiles))
-        .route("/v1/images/{id}/result.exr", get(images::result))
-        .route("/v1/images/{id}/preview.png", get(images::preview))
-        .route("/livez", get(|| async { "alive\n" }))
-        .route("/readyz", get(ready))
+    let charged = from_fn_with_state(service.clone(), charge::charge);
+    openapi::calls()
+        .into_iter()
+        .fold(Router::new(), |router, call| {
+            // Not what says how the service is: that has to be known most when memory is short.
+            let handlers = call.handlers;
+            let free = !call.path.starts_with("/v1/");
+            router.route(call.path, if free { handlers } else { handlers.route_layer(charged.clone()) })
+        })
         .fallback(nothing)
         .method_not_allowed_fallback(not_allowed)
+        // The last of these comes first.
+        .layer(from_fn_with_state(service.clone(), auth::admit))
         .layer(map_request(body::linger))
-        .layer(from_fn(log))
+        .layer(from_fn_with_state(service.clone(), trace::observe))
         .with_state(service)
 }
 
-async fn ready(State(service): State<Shared>) -> Result<&'static str, Refusal> {
-    if service.draining.load(Ordering::Relaxed) {
-        let detail = "it finishes what it has begun and takes nothing new";
-        return Err(Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "draining", "The service is stopping", detail));
-    }
-    Ok("ready\n")
+/// What is served on the address for metrics.
+pub(super) fn metrics_router(service: Shared) -> Router {
+    Router::new()
+        .route("/metrics", get(metrics::metrics))
+        .fallback(nothing)
+        .method_not_allowed_fallback(not_allowed)
+        .with_state(service)
 }
 
 async fn nothing(uri: Uri) -> Refusal {
@@ -48,14 +45,4 @@ async fn nothing(uri: Uri) -> Refusal {
 async fn not_allowed(method: Method, uri: Uri) -> Refusal {
     let detail = format!("{method} means nothing at {}; the header Allow says what does", uri.path());
     Refusal::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", "The method is not allowed here", detail)
-}
-
-/// One line a request, when its answer begins.
-async fn log(request: Request, next: Next) -> Response {
-    let (method, path) = (request.method().clone(), request.uri().path().to_owned());
-    let started = Instant::now();
-    let response = next.run(request).await;
-    let seconds = started.elapsed().as_secs_f64();
-    tracing::info!(%method, path, status = response.status().as_u16(), seconds, "request");
-    response
 }

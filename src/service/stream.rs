@@ -18,23 +18,26 @@ use axum::{
     http::{StatusCode, header},
     response::{IntoResponse, Response},
 };
-use futures_util::StreamExt;
 use rayon::ThreadPool;
 use serde_json::json;
 use tokio::{sync::watch, task::JoinSet};
+use tracing::Instrument;
 
 use super::{
     Shared,
     body::Frames,
+    charge::{Charge, keep},
+    metrics::Phase,
     picture::{CorePixels, encode_png, write_file},
     problem::{Refusal, corners, internal},
     query::{Form, Parameters, attributes},
     receive::{Fault, Received, Receiver},
     registry::{Id, Opened},
     results::{Results, file_response},
-    work::{Stop, blocking},
+    work::{blocking, stopped},
 };
 use crate::{
+    admission::Permit,
     filter::{
         Execution, Filtered, Method, Rect, SampleTile, filter,
         plan::{Plan, Shape, plan},
@@ -43,6 +46,9 @@ use crate::{
     stitch::ExrOptions,
     wire::{Header, Problem, TileReport, message},
 };
+
+/// Bytes of unread failures at most: nothing was reserved for them.
+const MAX_UNPAID: u64 = 1 << 20;
 
 /// One request: how to filter, and where results go.
 pub(super) struct Call {
@@ -101,8 +107,14 @@ impl Call {
         }
     }
 
-    /// Filters a tile; its samples, and the memory they took, are free afterwards. `None`: it was stopped.
-    fn filter(&self, tile: SampleTile, mut held: Held, pool: &ThreadPool, stop: &AtomicBool) -> Option<(Done, Held)> {
+    /// Filters a tile; its samples, and the memory they took, are free afterwards.
+    fn filter(
+        &self,
+        tile: SampleTile,
+        mut held: Held,
+        pool: &ThreadPool,
+        stop: &AtomicBool,
+    ) -> Result<(Done, Held), Refusal> {
         let started = Instant::now();
         let execution = Execution {
             seed: self.seed,
@@ -112,63 +124,68 @@ impl Call {
             simd: self.service.config.simd,
             ..Execution::default()
         };
-        let filtered = filter(&tile, &self.method, &execution).ok()?;
+        let filtered = filter(&tile, &self.method, &execution).map_err(|_| stopped())?;
+        self.service.metrics.phase(Phase::Filter, started);
         drop(tile);
         held.permit.shrink_to(held.output);
         let seconds = started.elapsed().as_secs_f64();
         let report = TileReport::new(&filtered.report, &self.method, self.seed, seconds);
         tracing::debug!(tile = %filtered.core, seconds, samples = report.samples, exact = report.exact, "tile filtered");
-        Some((Done { filtered, report }, held))
+        Ok((Done { filtered, report }, held))
     }
 
-    /// All that is done with a tile, on a thread that may block.
+    /// All that is done with a tile, on a thread that may block; says what became of it.
     fn process(
         &self,
         received: Received,
         results: &Results,
         pool: &ThreadPool,
         stop: &AtomicBool,
-    ) -> Result<(), Refusal> {
+    ) -> Result<&'static str, Refusal> {
         if stop.load(Ordering::Relaxed) {
-            return Ok(());
+            return Err(stopped());
         }
         let geometry = *received.assembler.header().geometry();
-        let Received { assembler, plan, permit } = received;
+        let Received { assembler, plan, permit, unread } = received;
         let held = Held { permit, output: plan.output };
         let tile = assembler.finish()?;
         match &self.target {
             Target::Client => {
-                let Some((Done { filtered, report }, _held)) = self.filter(tile, held, pool, stop) else {
-                    return Ok(());
-                };
+                let (Done { filtered, report }, _held) = self.filter(tile, held, pool, stop)?;
                 let image = [geometry.image().width, geometry.image().height];
-                results.append(|mut out| message::encode_result(image, &filtered, &report, &mut out))?;
+                let began = Instant::now();
+                results.append(Some(unread), |mut out| message::encode_result(image, &filtered, &report, &mut out))?;
+                self.service.metrics.phase(Phase::Write, began);
+                Ok("filtered")
             }
             Target::Image { image, replace } => {
                 let state = match image.offer(&tile, *replace)? {
                     Outcome::Repeated => "repeated",
                     Outcome::Stored => "stored",
                     Outcome::Filter(claim) => {
-                        let Some((Done { filtered, report }, _held)) = self.filter(tile, held, pool, stop) else {
-                            return Ok(());
-                        };
-                        image.add(claim, &filtered, report.seconds)?
+                        let (Done { filtered, report }, _held) = self.filter(tile, held, pool, stop)?;
+                        let began = Instant::now();
+                        let state = image.add(claim, &filtered, report.seconds)?;
+                        self.service.metrics.phase(Phase::Write, began);
+                        state
                     }
                 };
                 image.flush(&self.service)?;
                 let line = json!({ "tile": corners(geometry.core()), "state": state });
-                results.append(|out| writeln!(out, "{line}"))?;
+                results.append(Some(unread), |out| writeln!(out, "{line}"))?;
+                Ok(state)
             }
         }
-        Ok(())
     }
 
     /// Writes a failure in a result's place.
     async fn report(&self, results: &Arc<Results>, tile: Option<Rect>, problem: Box<Problem>) {
         tracing::debug!(tile = tile.map(tracing::field::display), code = problem.code, "tile refused");
+        self.service.metrics.problem(&problem.code);
+        self.service.metrics.tile("failed");
         let (results, lines) = (Arc::clone(results), self.lines());
         let written = blocking(move || {
-            results.append(|mut out| {
+            results.append(None, |mut out| {
                 if lines {
                     let line = json!({ "tile": tile.map(corners), "state": "error", "problem": problem });
                     return writeln!(out, "{line}");
@@ -183,7 +200,7 @@ impl Call {
     async fn end(&self, results: Arc<Results>, tiles: u64, errors: u64) {
         let lines = self.lines();
         let written = blocking(move || {
-            results.append(|mut out| {
+            results.append(None, |mut out| {
                 if lines {
                     let line = json!({ "state": "end", "tiles": tiles, "errors": errors });
                     return writeln!(out, "{line}");
@@ -203,7 +220,7 @@ impl Call {
 
 /// Memory that a tile holds, and how much of it its result needs.
 struct Held {
-    permit: crate::admission::Permit,
+    permit: Permit,
     output: u64,
 }
 
@@ -215,20 +232,29 @@ fn log(written: Result<io::Result<()>, Refusal>) {
 }
 
 /// `POST /v1/filter`.
-pub(super) async fn filter_stream(State(service): State<Shared>, request: Request) -> Result<Response, Refusal> {
+pub(super) async fn filter_stream(
+    State(service): State<Shared>,
+    charge: Charge,
+    request: Request,
+) -> Result<Response, Refusal> {
     let form = Form::accepted(request.headers())?;
     let mut parameters = Parameters::of_query(request.uri())?;
     let leave_out = parameters.leave_out()?;
     let (method, seed) = parameters.method()?;
     let call = Call::new(service, Arc::new(method), seed, leave_out, Target::Client);
     match form {
-        Form::Messages => answer(call, request, form.media()).await,
-        Form::Exr | Form::Png => single(call, request, form).await,
+        Form::Messages => answer(call, charge, request, form.media()).await,
+        Form::Exr | Form::Png => single(call, charge, request, form).await,
     }
 }
 
 /// `POST /v1/images/{id}/tiles`.
-pub(super) async fn image_tiles(State(service): State<Shared>, id: Id, request: Request) -> Result<Response, Refusal> {
+pub(super) async fn image_tiles(
+    State(service): State<Shared>,
+    id: Id,
+    charge: Charge,
+    request: Request,
+) -> Result<Response, Refusal> {
     let images = Arc::clone(&service);
     let image = blocking(move || images.images.find(&id)).await??;
     let mut parameters = Parameters::of_query(request.uri())?;
@@ -236,12 +262,12 @@ pub(super) async fn image_tiles(State(service): State<Shared>, id: Id, request: 
     parameters.done("replace")?;
     let (method, seed, leave_out) = image.method();
     let call = Call::new(service, method, seed, leave_out, Target::Image { image, replace });
-    answer(call, request, "application/x-ndjson").await
+    answer(call, charge, request, "application/x-ndjson").await
 }
 
-fn receiver(call: &Call, request: Request) -> Result<Receiver, Refusal> {
+fn receiver(call: &Call, charge: Charge, request: Request) -> Result<Receiver, Refusal> {
     let (parts, body) = request.into_parts();
-    Ok(Receiver::new(Frames::new(&parts.headers, body, call.service.config.idle_deadline)?))
+    Ok(Receiver::new(Frames::new(&parts.headers, body, charge, call.service.pace())?))
 }
 
 /// The first tile; a failure is the answer to the whole request.
@@ -255,41 +281,29 @@ async fn first(call: &Call, receiver: &mut Receiver) -> Result<Received, Refusal
 }
 
 /// Answers with a result stream.
-async fn answer(call: Call, request: Request, media: &'static str) -> Result<Response, Refusal> {
-    let mut receiver = receiver(&call, request)?;
+async fn answer(call: Call, charge: Charge, request: Request, media: &'static str) -> Result<Response, Refusal> {
+    let mut receiver = receiver(&call, charge, request)?;
     let received = first(&call, &mut receiver).await?;
     let folder = call.service.config.data_dir.clone();
     let (results, reader) = blocking(move || Results::new(&folder)).await??;
-    let stop = Stop::default();
-    let session = tokio::spawn(session(Arc::new(call), receiver, received, Arc::new(results), stop.flag()));
     // The body is dropped when all is sent, or when the client has gone.
-    let guard = Guard { session, _stop: stop };
-    let body = reader.inspect(move |_| {
-        let _ = &guard;
-    });
-    Ok((StatusCode::OK, [(header::CONTENT_TYPE, media)], Body::from_stream(body)).into_response())
+    let session = session(Arc::new(call), receiver, received, Arc::new(results));
+    let guard = Guard(tokio::spawn(session.in_current_span()));
+    let body = keep(Body::from_stream(reader), guard);
+    Ok((StatusCode::OK, [(header::CONTENT_TYPE, media)], body).into_response())
 }
 
-/// Ends a session when it is dropped.
-struct Guard {
-    session: tokio::task::JoinHandle<()>,
-    _stop: Stop,
-}
+/// Ends a session, and with it its jobs, when it is dropped.
+struct Guard(tokio::task::JoinHandle<()>);
 
 impl Drop for Guard {
     fn drop(&mut self) {
-        self.session.abort();
+        self.0.abort();
     }
 }
 
 /// Reads and filters tiles until the stream ends. Results are written as they are done, in any order.
-async fn session(
-    call: Arc<Call>,
-    mut receiver: Receiver,
-    received: Received,
-    results: Arc<Results>,
-    stop: Arc<AtomicBool>,
-) {
+async fn session(call: Arc<Call>, mut receiver: Receiver, received: Received, results: Arc<Results>) {
     let started = Instant::now();
     let (mut tiles, mut errors) = (0, 0);
     let mut count = |fine: Option<Result<bool, _>>| match fine {
@@ -302,7 +316,8 @@ async fn session(
         match next {
             Ok(Some(received)) => {
                 call.busy.send_modify(|tiles| *tiles += 1);
-                jobs.spawn(job(Arc::clone(&call), received, Arc::clone(&results), Arc::clone(&stop)));
+                let job = job(Arc::clone(&call), received, Arc::clone(&results));
+                jobs.spawn(job.in_current_span());
                 // One more than can run, so that there always is one to run.
                 if jobs.len() > call.service.work.jobs() {
                     count(jobs.join_next().await);
@@ -323,7 +338,7 @@ async fn session(
                 break;
             }
         }
-        next = receiver.next(&call).await;
+        next = if results.unpaid() > MAX_UNPAID { Err(Fault::unread()) } else { receiver.next(&call).await };
     }
     while let Some(fine) = jobs.join_next().await {
         count(Some(fine));
@@ -332,15 +347,38 @@ async fn session(
     call.end(results, tiles, errors).await;
 }
 
+/// Counts what becomes of a tile when it is dropped, which without a word is that its client went away.
+struct Fate<'a>(Option<&'static str>, &'a Call);
+
+impl<'a> Fate<'a> {
+    const fn new(call: &'a Call) -> Self {
+        Self(Some("stopped"), call)
+    }
+}
+
+impl Drop for Fate<'_> {
+    fn drop(&mut self) {
+        if let Some(outcome) = self.0 {
+            self.1.service.metrics.tile(outcome);
+        }
+    }
+}
+
 /// One tile, from its samples to its place among the results. Says whether it went well.
-async fn job(call: Arc<Call>, received: Received, results: Arc<Results>, stop: Arc<AtomicBool>) -> bool {
+async fn job(call: Arc<Call>, received: Received, results: Arc<Results>) -> bool {
     let core = received.core();
     let (inner, out) = (Arc::clone(&call), Arc::clone(&results));
-    let done = call.service.work.run(move |pool| inner.process(received, &out, pool, &stop)).await;
+    let mut fate = Fate::new(&call);
+    let done = call.service.work.run(move |pool, stop| inner.process(received, &out, pool, stop)).await;
     call.busy.send_modify(|tiles| *tiles -= 1);
-    match done.flatten() {
-        Ok(()) => true,
+    match done {
+        Ok(outcome) => {
+            fate.0 = Some(outcome);
+            true
+        }
         Err(refusal) => {
+            // Whoever reports it counts it.
+            fate.0 = None;
             call.report(&results, Some(core), refusal.0).await;
             false
         }
@@ -348,16 +386,19 @@ async fn job(call: Arc<Call>, received: Received, results: Arc<Results>, stop: A
 }
 
 /// Answers with a picture of a single tile.
-async fn single(call: Call, request: Request, form: Form) -> Result<Response, Refusal> {
-    let mut receiver = receiver(&call, request)?;
+async fn single(call: Call, charge: Charge, request: Request, form: Form) -> Result<Response, Refusal> {
+    let mut receiver = receiver(&call, charge, request)?;
     let received = first(&call, &mut receiver).await?;
-    receiver.end(&call).await?;
-    let stop = Stop::default();
-    let flag = stop.flag();
+    receiver.end().await?;
     let call = Arc::new(call);
     let inner = Arc::clone(&call);
-    let file = call.service.work.run(move |pool| picture(&inner, received, form, pool, &flag)).await??;
-    Ok(file_response(file, form.media()).await?)
+    let mut fate = Fate::new(&call);
+    let done = call.service.work.run(move |pool, stop| picture(&inner, received, form, pool, stop)).await;
+    fate.0 = Some(if done.is_ok() { "filtered" } else { "failed" });
+    let (file, unread) = done?;
+    let answer = file_response(file, form.media()).await?;
+    // The file lies on the disk until it is sent.
+    Ok(answer.map(|body| keep(body, unread)))
 }
 
 fn picture(
@@ -366,21 +407,19 @@ fn picture(
     form: Form,
     pool: &ThreadPool,
     stop: &AtomicBool,
-) -> Result<std::fs::File, Refusal> {
-    let Received { assembler, plan, permit } = received;
+) -> Result<(std::fs::File, Permit), Refusal> {
+    let Received { assembler, plan, permit, unread } = received;
     let geometry = *assembler.header().geometry();
     let held = Held { permit, output: plan.output };
-    let filtered = call.filter(assembler.finish()?, held, pool, stop);
-    let Some((done, _held)) = filtered else {
-        return Err(Problem::new(503, "stopped", "The work was stopped", "the client has gone").into());
-    };
+    let (done, _held) = call.filter(assembler.finish()?, held, pool, stop)?;
     let mut options = ExrOptions { attributes: attributes(&call.method, call.seed), ..ExrOptions::default() };
     if geometry.core() != geometry.image() {
         options.attributes.insert("rpfd:tile".into(), geometry.core().to_string());
     }
     let pixels = CorePixels(&done.filtered);
-    write_file(&call.service.config.data_dir, |out| match form {
+    let file = write_file(&call.service.config.data_dir, |out| match form {
         Form::Png => encode_png(&pixels, out),
         _ => Ok(crate::stitch::exr::encode(&pixels, &options, out).map(drop)?),
-    })
+    })?;
+    Ok((file, unread))
 }

@@ -3,9 +3,11 @@
 use super::{
     Fault, Header, MAX_HEADER, WireError,
     header_read::read_header,
-    token::{HeadReader, Scanner, Token},
+    pull::{MapReader, Place, Pull},
+    token::{HeadReader, Token},
     value::CountReader,
 };
+use crate::filter::Rect;
 
 /// A part of a tile, in the order of the stream: the header; with varying samples the counts; for every plane either
 /// one constant, or pieces of values and the plane's end; the tile's end.
@@ -67,7 +69,7 @@ impl Step {
 #[derive(Debug)]
 enum State {
     /// In, or ahead of, a header.
-    Header(Scanner),
+    Header,
     /// At the marker of the counts.
     CountsHead,
     /// In the counts, so many bytes before their end.
@@ -82,16 +84,13 @@ enum State {
 #[derive(Debug)]
 pub struct Decoder {
     state: State,
-    /// Bytes of the header, until it is whole.
-    map: Vec<u8>,
+    place: Place,
+    map: MapReader,
     head: HeadReader,
     header: Option<Header>,
     counts: CountReader,
     /// Sum of the counts so far.
     sum: u64,
-    offset: u64,
-    tiles: u64,
-    failed: Option<WireError>,
 }
 
 impl Default for Decoder {
@@ -104,15 +103,13 @@ impl Decoder {
     /// Ready for the first byte of a stream.
     pub fn new() -> Self {
         Self {
-            state: State::Header(Scanner::new()),
-            map: Vec::new(),
+            state: State::Header,
+            place: Place::default(),
+            map: MapReader::new(MAX_HEADER),
             head: HeadReader::default(),
             header: None,
             counts: CountReader::default(),
             sum: 0,
-            offset: 0,
-            tiles: 0,
-            failed: None,
         }
     }
 
@@ -121,51 +118,38 @@ impl Decoder {
         self.header.as_ref()
     }
 
+    /// Whether no tile has begun that has not ended.
+    pub const fn between(&self) -> bool {
+        matches!(self.state, State::Header) && self.map.is_empty()
+    }
+
     /// Bytes taken so far.
     pub const fn offset(&self) -> u64 {
-        self.offset
+        self.place.offset
     }
 
     /// Tiles read to their end so far.
     pub const fn tiles(&self) -> u64 {
-        self.tiles
+        self.place.index
     }
 
     /// Takes bytes from the front of `input` up to the end of the next event. `Ok(None)`: all of `input` was taken, and
     /// more is needed. After an error every later call returns the same one.
     pub fn next<'a>(&mut self, input: &mut &'a [u8]) -> Result<Option<Event<'a>>, WireError> {
         let all = *input;
-        let step = self.step(input)?;
+        let step = self.pull(input)?;
         Ok(step.map(|step| step.event(&all[..all.len() - input.len()])))
-    }
-
-    pub(super) fn step(&mut self, input: &mut &[u8]) -> Result<Option<Step>, WireError> {
-        if let Some(error) = &self.failed {
-            return Err(error.clone());
-        }
-        let before = input.len();
-        let result = self.advance(input);
-        self.offset += (before - input.len()) as u64;
-        result.map_err(|fault| {
-            let error = self.error(fault);
-            self.failed = Some(error.clone());
-            error
-        })
     }
 
     /// Says whether the stream may end here: between tiles, after at least one.
     pub fn finish(&self) -> Result<(), WireError> {
-        if let Some(error) = &self.failed {
-            return Err(error.clone());
-        }
+        self.alive()?;
         let name = |plane: usize| self.header.as_ref().map_or_else(String::new, |h| h.channels().plane_name(plane));
         let planes = self.header.as_ref().map_or(0, |h| h.channels().planes());
         let (place, missing) = match &self.state {
-            State::Header(_) if self.offset == 0 => return Err(self.error(Fault::Empty)),
-            State::Header(_) if self.map.is_empty() => return Ok(()),
-            State::Header(scanner) => {
-                ("a header".to_owned(), format!("at least {} bytes of it are missing", scanner.wanted()))
-            }
+            State::Header if self.place.offset == 0 => return Err(self.error(Fault::Empty)),
+            State::Header if self.map.is_empty() => return Ok(()),
+            State::Header => ("a header".to_owned(), format!("at least {} bytes of it are missing", self.map.wanted())),
             State::CountsHead => {
                 ("a tile".to_owned(), format!("the sample counts and all {planes} planes are missing"))
             }
@@ -184,95 +168,13 @@ impl Decoder {
         Err(self.error(Fault::Truncated { place, missing }))
     }
 
-    fn error(&self, fault: Fault) -> WireError {
-        let tile = self.header.as_ref().map(|header| header.geometry().core());
-        WireError { fault, offset: self.offset, index: self.tiles, tile }
-    }
-
-    fn advance(&mut self, input: &mut &[u8]) -> Result<Option<Step>, Fault> {
-        loop {
-            match &mut self.state {
-                State::Header(_) => return self.read_header(input),
-                State::CountsHead => {
-                    let Some(head) = self.read_head(input)? else { return Ok(None) };
-                    let pixels = self.header.as_ref().map_or(0, |h| h.geometry().window().area());
-                    let expected = 2 * pixels;
-                    match head {
-                        Token::Bin(found) if found == expected => self.state = State::Counts(expected),
-                        Token::Bin(found) => {
-                            let plane = "of sample counts".to_owned();
-                            return Err(Fault::PlaneSize { plane, found, expected });
-                        }
-                        other => {
-                            let right = format!("they must be a bin of {expected} bytes");
-                            let what = "the plane of sample counts".to_owned();
-                            return Err(Fault::WrongType { what, found: other.describe(), right });
-                        }
-                    }
-                }
-                State::Counts(left) => {
-                    if input.is_empty() {
-                        return Ok(None);
-                    }
-                    let bytes = take(input, left);
-                    let ended = *left == 0;
-                    self.counts.push(bytes, |count| self.sum += u64::from(count));
-                    if ended {
-                        self.state = State::PlaneHead(0);
-                        self.check_counts()?;
-                    }
-                    return Ok(Some(Step::Counts(bytes.len())));
-                }
-                State::PlaneHead(plane) => {
-                    let plane = *plane;
-                    if self.header.as_ref().is_none_or(|header| plane == header.channels().planes()) {
-                        self.tiles += 1;
-                        self.header = None;
-                        self.state = State::Header(Scanner::new());
-                        return Ok(Some(Step::TileEnd));
-                    }
-                    let Some(head) = self.read_head(input)? else { return Ok(None) };
-                    if let Some(value) = self.plane_head(plane, head)? {
-                        self.state = State::PlaneHead(plane + 1);
-                        return Ok(Some(Step::Constant { plane, value }));
-                    }
-                }
-                State::Plane(plane, left) => {
-                    let plane = *plane;
-                    if *left == 0 {
-                        self.state = State::PlaneHead(plane + 1);
-                        return Ok(Some(Step::PlaneEnd { plane }));
-                    }
-                    if input.is_empty() {
-                        return Ok(None);
-                    }
-                    let len = take(input, left).len();
-                    return Ok(Some(Step::Values { plane, len }));
-                }
-            }
-        }
-    }
-
     fn read_header(&mut self, input: &mut &[u8]) -> Result<Option<Step>, Fault> {
-        let State::Header(scanner) = &mut self.state else { return Ok(None) };
         let Some(&first) = input.first() else { return Ok(None) };
-        if self.map.is_empty() && !matches!(first, 0x80..=0x8f | 0xde | 0xdf) {
+        if self.map.is_empty() && !MapReader::starts(first) {
             return Err(self.no_header(input));
         }
-        let before = *input;
-        let whole = scanner.push(input).map_err(|_| reserved())?;
-        let taken = before.len() - input.len();
-        // What is announced counts as well: no need to wait for what will be refused.
-        let size = (self.map.len() + taken) as u64;
-        if size.saturating_add(scanner.wanted()) > MAX_HEADER as u64 {
-            return Err(Fault::HeaderTooLarge { limit: MAX_HEADER as u64 });
-        }
-        self.map.extend_from_slice(&before[..taken]);
-        if !whole {
-            return Ok(None);
-        }
-        let header = read_header(&self.map)?;
-        self.map.clear();
+        let Some(map) = self.map.push(input)? else { return Ok(None) };
+        let header = read_header(&map)?;
         self.sum = 0;
         self.state = if header.varying() { State::CountsHead } else { State::PlaneHead(0) };
         self.header = Some(header.clone());
@@ -286,7 +188,7 @@ impl Decoder {
             Ok(Some(token)) => token.describe(),
             _ => format!("the byte {:#04x}", input[0]),
         };
-        if self.tiles > 0 {
+        if self.place.index > 0 {
             return Fault::Trailing(object);
         }
         Fault::NotATile(match input {
@@ -295,10 +197,6 @@ impl Decoder {
             [b'{' | b'[', ..] => format!("{object} (is it JSON?)"),
             _ => object,
         })
-    }
-
-    fn read_head(&mut self, input: &mut &[u8]) -> Result<Option<Token>, Fault> {
-        self.head.push(input).map_err(|_| reserved())
     }
 
     /// Judges the head of a plane: the value of a constant, or the state is now within the plane.
@@ -330,6 +228,86 @@ impl Decoder {
     }
 }
 
+impl Pull for Decoder {
+    type Out = Step;
+
+    fn place(&self) -> &Place {
+        &self.place
+    }
+
+    fn place_mut(&mut self) -> &mut Place {
+        &mut self.place
+    }
+
+    fn tile(&self) -> Option<Rect> {
+        self.header.as_ref().map(|header| header.geometry().core())
+    }
+
+    fn advance(&mut self, input: &mut &[u8]) -> Result<Option<Step>, Fault> {
+        loop {
+            match &mut self.state {
+                State::Header => return self.read_header(input),
+                State::CountsHead => {
+                    let Some(head) = self.head.push(input)? else { return Ok(None) };
+                    let pixels = self.header.as_ref().map_or(0, |h| h.geometry().window().area());
+                    let expected = 2 * pixels;
+                    match head {
+                        Token::Bin(found) if found == expected => self.state = State::Counts(expected),
+                        Token::Bin(found) => {
+                            let plane = "of sample counts".to_owned();
+                            return Err(Fault::PlaneSize { plane, found, expected });
+                        }
+                        other => {
+                            let right = format!("they must be a bin of {expected} bytes");
+                            let what = "the plane of sample counts".to_owned();
+                            return Err(Fault::WrongType { what, found: other.describe(), right });
+                        }
+                    }
+                }
+                State::Counts(left) => {
+                    if input.is_empty() {
+                        return Ok(None);
+                    }
+                    let bytes = take(input, left);
+                    let ended = *left == 0;
+                    self.counts.push(bytes, |count| self.sum += u64::from(count));
+                    if ended {
+                        self.state = State::PlaneHead(0);
+                        self.check_counts()?;
+                    }
+                    return Ok(Some(Step::Counts(bytes.len())));
+                }
+                State::PlaneHead(plane) => {
+                    let plane = *plane;
+                    if self.header.as_ref().is_none_or(|header| plane == header.channels().planes()) {
+                        self.place.index += 1;
+                        self.header = None;
+                        self.state = State::Header;
+                        return Ok(Some(Step::TileEnd));
+                    }
+                    let Some(head) = self.head.push(input)? else { return Ok(None) };
+                    if let Some(value) = self.plane_head(plane, head)? {
+                        self.state = State::PlaneHead(plane + 1);
+                        return Ok(Some(Step::Constant { plane, value }));
+                    }
+                }
+                State::Plane(plane, left) => {
+                    let plane = *plane;
+                    if *left == 0 {
+                        self.state = State::PlaneHead(plane + 1);
+                        return Ok(Some(Step::PlaneEnd { plane }));
+                    }
+                    if input.is_empty() {
+                        return Ok(None);
+                    }
+                    let len = take(input, left).len();
+                    return Ok(Some(Step::Values { plane, len }));
+                }
+            }
+        }
+    }
+}
+
 /// Takes at most `left` bytes from the front.
 fn take<'a>(input: &mut &'a [u8], left: &mut u64) -> &'a [u8] {
     let len = (*left).min(input.len() as u64);
@@ -337,8 +315,4 @@ fn take<'a>(input: &mut &'a [u8], left: &mut u64) -> &'a [u8] {
     *left -= len;
     *input = rest;
     taken
-}
-
-pub(super) fn reserved() -> Fault {
-    Fault::Malformed("the byte 0xc1, which starts no MessagePack object".to_owned())
 }

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use super::{Assembler, Decoder, Event, Header, WireError, encode_tile};
+use super::{Assembler, Decoder, Event, Header, WireError, encode_tile, pull::Pull};
 use crate::filter::{SampleTile, samples::SampleError};
 
 /// Largest window that a compressed file may ask for, as a power of two: 128 MiB.
@@ -18,9 +18,25 @@ const ZSTD_MAGIC: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
 /// Most bytes that the head of a zstd frame has.
 const ZSTD_HEADER: usize = 18;
 
-/// The window of a zstd frame with this head (RFC 8878, 3.1.1.1), at most what is allowed; never 0.
-fn window_bytes(head: &[u8]) -> u64 {
+/// Bytes that the head of a zstd frame has, or the least that it must have if these first ones do not tell yet.
+pub(crate) fn frame_head_len(head: &[u8]) -> usize {
+    match head {
+        [a, b, c, d, descriptor, ..] if [*a, *b, *c, *d] == ZSTD_MAGIC => {
+            let single = descriptor & 0x20 != 0;
+            let content = [usize::from(single), 2, 4, 8][usize::from(descriptor >> 6)];
+            5 + usize::from(!single) + [0, 1, 2, 4][usize::from(descriptor & 3)] + content
+        }
+        _ => 5,
+    }
+}
+
+/// The window of a zstd frame with this head (RFC 8878, 3.1.1.1), at most what is allowed; never 0. Of what is no zstd
+/// frame, 1.
+pub(crate) fn window_bytes(head: &[u8]) -> u64 {
     let at = |index: usize| u64::from(head.get(index).copied().unwrap_or(0));
+    if !head.starts_with(&ZSTD_MAGIC) {
+        return 1;
+    }
     let descriptor = at(4);
     let window = if descriptor & 0x20 == 0 {
         let base = 1 << (10 + (at(5) >> 3));
@@ -150,7 +166,7 @@ impl TileFile {
     pub fn next_event(&mut self) -> Result<Option<Event<'_>>, FileError> {
         loop {
             let mut input = &self.buffer[self.start..self.end];
-            let step = self.decoder.step(&mut input);
+            let step = self.decoder.pull(&mut input);
             let from = self.start;
             self.start = self.end - input.len();
             match step {
@@ -323,6 +339,8 @@ mod tests {
         assert_eq!(window(&[0xa1, 9, 0, 0, 1, 0]), 1 << 16);
         // What is beyond the limit is refused when it is read.
         assert_eq!((window(&[0x00, 0xff]), window(&[])), (1 << MAX_WINDOW_LOG, 1 << 10));
+        // A skippable frame has none.
+        assert_eq!(window_bytes(b"\x50\x2a\x4d\x18\x03"), 1);
         let mut encoder = zstd::Encoder::new(Vec::new(), 3).unwrap();
         encoder.write_all(&[7; 1 << 22]).unwrap();
         assert_eq!(window_bytes(&encoder.finish().unwrap()), 2 << 20);

@@ -21,6 +21,7 @@ pub mod header;
 mod header_read;
 pub mod message;
 pub mod problem;
+mod pull;
 pub mod results;
 pub mod scan;
 mod token;

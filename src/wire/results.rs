@@ -4,9 +4,9 @@ use serde::{Deserialize, de::DeserializeOwned};
 
 use super::{
     Fault, Format, Message, Problem, TileReport, TileResult, WireError,
-    decoder::reserved,
     header_read::Fields,
     message::MAX_MESSAGE,
+    pull::{MapReader, Place, Pull},
     token::{HeadReader, Scanner, Token},
     value::ValueReader,
 };
@@ -15,7 +15,7 @@ use crate::filter::{Halo, Rect, TileGeometry};
 #[derive(Debug)]
 enum State {
     /// In, or ahead of, a message's map.
-    Map(Scanner),
+    Map,
     /// In an object that belongs to a message of an unknown type.
     Skip(Scanner),
     /// At the marker of a plane.
@@ -29,16 +29,14 @@ enum State {
 #[derive(Debug)]
 pub struct ResultDecoder {
     state: State,
-    map: Vec<u8>,
+    place: Place,
+    map: MapReader,
     head: HeadReader,
     /// The result whose planes are being read, and how many of them are whole.
     result: Option<(Box<TileResult>, usize)>,
     /// Whether the last map had an unknown type, so that what follows may be its planes.
     unknown: bool,
     ended: bool,
-    offset: u64,
-    messages: u64,
-    failed: Option<WireError>,
 }
 
 impl Default for ResultDecoder {
@@ -51,110 +49,35 @@ impl ResultDecoder {
     /// Ready for the first byte of a stream.
     pub fn new() -> Self {
         Self {
-            state: State::Map(Scanner::new()),
-            map: Vec::new(),
+            state: State::Map,
+            place: Place::default(),
+            map: MapReader::new(MAX_MESSAGE),
             head: HeadReader::default(),
             result: None,
             unknown: false,
             ended: false,
-            offset: 0,
-            messages: 0,
-            failed: None,
         }
     }
 
     /// Takes bytes from the front of `input` up to the end of the next message. `Ok(None)`: all of `input` was taken,
     /// and more is needed. After an error every later call returns the same one.
     pub fn next(&mut self, input: &mut &[u8]) -> Result<Option<Message>, WireError> {
-        if let Some(error) = &self.failed {
-            return Err(error.clone());
-        }
-        let before = input.len();
-        let result = self.advance(input);
-        self.offset += (before - input.len()) as u64;
-        result.map_err(|fault| {
-            let error = self.error(fault);
-            self.failed = Some(error.clone());
-            error
-        })
+        self.pull(input)
     }
 
     /// Says whether the stream may end here: after its `end` message.
     pub fn finish(&self) -> Result<(), WireError> {
-        match (&self.failed, self.ended) {
-            (Some(error), _) => Err(error.clone()),
-            (None, true) => Ok(()),
-            (None, false) if self.offset == 0 => Err(self.error(Fault::Empty)),
-            (None, false) => {
-                let place = format!("message {}", self.messages);
-                let missing = "the \"end\" message is missing, the connection was cut".to_owned();
-                Err(self.error(Fault::Truncated { place, missing }))
-            }
+        self.alive()?;
+        if self.ended {
+            return Ok(());
         }
-    }
-
-    fn error(&self, fault: Fault) -> WireError {
-        let tile = self.result.as_ref().map(|(result, _)| result.core);
-        WireError { fault, offset: self.offset, index: self.messages, tile }
-    }
-
-    fn advance(&mut self, input: &mut &[u8]) -> Result<Option<Message>, Fault> {
-        loop {
-            let Some(&first) = input.first() else { return Ok(None) };
-            match &mut self.state {
-                State::Map(_) if self.ended => return Err(Fault::Trailing(format!("the byte {first:#04x}"))),
-                State::Map(_) if self.map.is_empty() && !matches!(first, 0x80..=0x8f | 0xde | 0xdf) => {
-                    if !self.unknown {
-                        let found = format!("the byte {first:#04x}");
-                        let right = "it must be a map".to_owned();
-                        return Err(Fault::WrongType { what: "a message".to_owned(), found, right });
-                    }
-                    self.state = State::Skip(Scanner::new());
-                }
-                State::Map(scanner) => {
-                    let before = *input;
-                    let whole = scanner.push(input).map_err(|_| reserved())?;
-                    let taken = before.len() - input.len();
-                    let size = (self.map.len() + taken) as u64;
-                    if size.saturating_add(scanner.wanted()) > MAX_MESSAGE as u64 {
-                        return Err(Fault::HeaderTooLarge { limit: MAX_MESSAGE as u64 });
-                    }
-                    self.map.extend_from_slice(&before[..taken]);
-                    if whole && let Some(message) = self.read_map()? {
-                        return Ok(Some(message));
-                    }
-                }
-                State::Skip(scanner) => {
-                    if scanner.push(input).map_err(|_| reserved())? {
-                        self.state = State::Map(Scanner::new());
-                    }
-                }
-                State::PlaneHead => {
-                    let Some(head) = self.head.push(input).map_err(|_| reserved())? else { return Ok(None) };
-                    self.plane_head(head)?;
-                }
-                State::Plane(reader, left) => {
-                    let len = (*left).min(input.len() as u64);
-                    let (bytes, rest) = input.split_at(len as usize);
-                    *input = rest;
-                    *left -= len;
-                    let ended = *left == 0;
-                    if let Some((result, plane)) = &mut self.result {
-                        let values = &mut result.rgb[*plane];
-                        reader.push(bytes, |value| values.push(value));
-                        *plane += usize::from(ended);
-                    }
-                    if ended {
-                        self.state = State::PlaneHead;
-                        if let Some((result, _)) = self.result.take_if(|(_, planes)| *planes == 3) {
-                            self.state = State::Map(Scanner::new());
-                            self.messages += 1;
-                            return Ok(Some(Message::Result(result)));
-                        }
-                    }
-                }
-            }
-        }
+        Err(self.error(if self.place.offset == 0 {
+            Fault::Empty
+        } else {
+            let place = format!("message {}", self.place.index);
+            let missing = "the \"end\" message is missing, the connection was cut".to_owned();
+            Fault::Truncated { place, missing }
+        }))
     }
 
     fn plane_head(&mut self, head: Token) -> Result<(), Fault> {
@@ -175,20 +98,18 @@ impl ResultDecoder {
     }
 
     /// Reads a whole map: a message, or none if planes follow or its type is unknown.
-    fn read_map(&mut self) -> Result<Option<Message>, Fault> {
-        let map = std::mem::take(&mut self.map);
-        self.state = State::Map(Scanner::new());
-        let fields = Fields::read("the message", &map)?;
+    fn read_map(&mut self, map: &[u8]) -> Result<Option<Message>, Fault> {
+        let fields = Fields::read("the message", map)?;
         let kind = fields.kind()?;
         self.unknown = !matches!(kind, "result" | "error" | "end");
         if self.unknown {
-            self.messages += 1;
+            self.place.index += 1;
             return Ok(None);
         }
         fields.check_version()?;
         let message = match kind {
             "result" => {
-                let ResultMap { image, tile, report } = typed(&map)?;
+                let ResultMap { image, tile, report } = typed(map)?;
                 let geometry = TileGeometry::new(image, rect(tile), Halo::default())?;
                 let core = geometry.core();
                 if 4 * core.area() > u64::from(u32::MAX) {
@@ -200,17 +121,86 @@ impl ResultDecoder {
                 return Ok(None);
             }
             "error" => {
-                let ErrorMap { tile, problem } = typed(&map)?;
+                let ErrorMap { tile, problem } = typed(map)?;
                 Message::Error { tile: tile.map(rect), problem: Box::new(problem) }
             }
             _ => {
-                let EndMap { tiles, errors } = typed(&map)?;
+                let EndMap { tiles, errors } = typed(map)?;
                 self.ended = true;
                 Message::End { tiles, errors }
             }
         };
-        self.messages += 1;
+        self.place.index += 1;
         Ok(Some(message))
+    }
+}
+
+impl Pull for ResultDecoder {
+    type Out = Message;
+
+    fn place(&self) -> &Place {
+        &self.place
+    }
+
+    fn place_mut(&mut self) -> &mut Place {
+        &mut self.place
+    }
+
+    fn tile(&self) -> Option<Rect> {
+        self.result.as_ref().map(|(result, _)| result.core)
+    }
+
+    fn advance(&mut self, input: &mut &[u8]) -> Result<Option<Message>, Fault> {
+        loop {
+            let Some(&first) = input.first() else { return Ok(None) };
+            match &mut self.state {
+                State::Map if self.ended => return Err(Fault::Trailing(format!("the byte {first:#04x}"))),
+                State::Map if self.map.is_empty() && !MapReader::starts(first) => {
+                    if !self.unknown {
+                        let found = format!("the byte {first:#04x}");
+                        let right = "it must be a map".to_owned();
+                        return Err(Fault::WrongType { what: "a message".to_owned(), found, right });
+                    }
+                    self.state = State::Skip(Scanner::new());
+                }
+                State::Map => {
+                    if let Some(map) = self.map.push(input)?
+                        && let Some(message) = self.read_map(&map)?
+                    {
+                        return Ok(Some(message));
+                    }
+                }
+                State::Skip(scanner) => {
+                    if scanner.push(input)? {
+                        self.state = State::Map;
+                    }
+                }
+                State::PlaneHead => {
+                    let Some(head) = self.head.push(input)? else { return Ok(None) };
+                    self.plane_head(head)?;
+                }
+                State::Plane(reader, left) => {
+                    let len = (*left).min(input.len() as u64);
+                    let (bytes, rest) = input.split_at(len as usize);
+                    *input = rest;
+                    *left -= len;
+                    let ended = *left == 0;
+                    if let Some((result, plane)) = &mut self.result {
+                        let values = &mut result.rgb[*plane];
+                        reader.push(bytes, |value| values.push(value));
+                        *plane += usize::from(ended);
+                    }
+                    if ended {
+                        self.state = State::PlaneHead;
+                        if let Some((result, _)) = self.result.take_if(|(_, planes)| *planes == 3) {
+                            self.state = State::Map;
+                            self.place.index += 1;
+                            return Ok(Some(Message::Result(result)));
+                        }
+                    }
+                }
+            }
+        }
     }
 }
 

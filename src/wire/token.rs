@@ -130,8 +130,8 @@ pub(super) struct Scanner {
 
 impl Scanner {
     /// Ready for the first byte of an object.
-    pub(super) fn new() -> Self {
-        Self { objects: 1, payload: 0, head: HeadReader::default() }
+    pub(super) const fn new() -> Self {
+        Self { objects: 1, payload: 0, head: HeadReader { bytes: [0; MAX_HEAD], len: 0 } }
     }
 
     /// Bytes that must still come at least.
@@ -141,25 +141,32 @@ impl Scanner {
 
     /// Takes bytes from the front of `input`; true once the object has ended.
     pub(super) fn push(&mut self, input: &mut &[u8]) -> Result<bool, ReservedMarker> {
-        loop {
-            let skipped = self.payload.min(input.len() as u64);
-            *input = &input[skipped as usize..];
-            self.payload -= skipped;
-            if self.payload > 0 {
-                return Ok(false);
-            }
-            if self.objects == 0 {
-                return Ok(true);
-            }
-            let Some(token) = self.head.push(input)? else { return Ok(false) };
-            self.objects -= 1;
-            match token {
-                Token::Str(bytes) | Token::Bin(bytes) | Token::Ext(bytes) => self.payload = bytes,
-                Token::Array(n) => self.objects = self.objects.saturating_add(n),
-                Token::Map(n) => self.objects = self.objects.saturating_add(2 * n),
-                Token::Nil | Token::Bool(_) | Token::Number(_) => {}
-            }
+        while self.step(input)? {}
+        Ok(self.ended())
+    }
+
+    /// Whether the object has ended.
+    pub(super) const fn ended(&self) -> bool {
+        self.objects == 0 && self.payload == 0
+    }
+
+    /// As [`push`](Self::push), but up to the next head only; false once it has ended or needs more.
+    pub(super) fn step(&mut self, input: &mut &[u8]) -> Result<bool, ReservedMarker> {
+        let skipped = self.payload.min(input.len() as u64);
+        *input = &input[skipped as usize..];
+        self.payload -= skipped;
+        if self.payload > 0 || self.objects == 0 {
+            return Ok(false);
         }
+        let Some(token) = self.head.push(input)? else { return Ok(false) };
+        self.objects -= 1;
+        match token {
+            Token::Str(bytes) | Token::Bin(bytes) | Token::Ext(bytes) => self.payload = bytes,
+            Token::Array(n) => self.objects = self.objects.saturating_add(n),
+            Token::Map(n) => self.objects = self.objects.saturating_add(2 * n),
+            Token::Nil | Token::Bool(_) | Token::Number(_) => {}
+        }
+        Ok(true)
     }
 }
 

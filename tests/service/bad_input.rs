@@ -138,11 +138,22 @@ fn requests_that_are_not_understood_have_a_code_and_a_status() {
         (r#"{"width": 4, "height": 4, "preset": "leen"}"#, "unknown_preset"),
         (r#"{"width": 4, "height": 4, "colour": true}"#, "unknown_parameter"),
         (r#"{"width": 4, "height": 4, "id": "../x"}"#, "bad_parameter"),
+        (r#"{"width": 4, "height": 4, "width": 4}"#, "duplicate_parameter"),
     ] {
         server.post("/v1/images", body.as_bytes()).problem(400, code);
     }
     server.post("/v1/images", &[b' '; 70_000]).problem(413, "body_too_large");
     assert_eq!(server.get("/v1/images").json(), json!({"images": []}));
+    for path in ["/livez", "/readyz", "/v1/images", "/v1/images/a", "/v1/images/a/preview.png"] {
+        let opened = server.post("/v1/images", br#"{"width": 4, "height": 4, "id": "a"}"#);
+        assert!(opened.status <= 201, "{opened:?}");
+        let problem = server.get(&format!("{path}?partiall=true")).problem(400, "unknown_parameter");
+        assert!(problem["detail"].as_str().unwrap().contains("known are"), "{problem}");
+    }
+    server.call("DELETE", "/v1/images/a?x", &[], &[]).problem(400, "unknown_parameter");
+    assert_eq!(server.call("DELETE", "/v1/images/a", &[], &[]).status, 204);
+    let problem = server.post("/v1/filter?presett=lean", &good).problem(400, "unknown_parameter");
+    assert!(problem["detail"].as_str().unwrap().contains("preset, seed and leave_out"), "{problem}");
     server.get("/").problem(404, "not_found");
     server.get("/v1/images/nobody").problem(404, "unknown_image");
     server.get("/v1/images/%ff").problem(404, "unknown_image");

@@ -56,6 +56,8 @@ fn the_table_is_what_the_sources_say() {
         let source = source.split("#[cfg(test)]").next().unwrap();
         for (name, status) in [
             ("BAD_REQUEST", 400),
+            ("UNAUTHORIZED", 401),
+            ("FORBIDDEN", 403),
             ("NOT_FOUND", 404),
             ("METHOD_NOT_ALLOWED", 405),
             ("NOT_ACCEPTABLE", 406),

@@ -3,12 +3,21 @@
 mod bad_input;
 mod clients;
 mod codes;
+mod config;
 mod curl;
+mod deploy;
 mod durable;
 pub(crate) mod exact;
+pub(crate) mod flow;
+mod http2;
 mod images;
 mod limits;
 pub(crate) mod neighbors;
+mod observe;
+mod openapi;
+mod proxy;
+mod stop;
+mod tokens;
 
 use std::{
     io::{BufRead, BufReader, Read, Write},
@@ -29,12 +38,21 @@ use serde_json::Value;
 pub(crate) struct Server {
     child: Child,
     pub(crate) address: String,
+    /// Where its metrics are, if it was told to have any.
+    metrics: Option<String>,
     folder: Option<tempfile::TempDir>,
 }
 
 impl Server {
     pub(crate) fn start(arguments: &[&str]) -> Self {
-        Self::start_in(tempfile::tempdir().unwrap(), arguments)
+        Self::start_logging(arguments, None)
+    }
+
+    /// As `start`, with the log in a file.
+    pub(crate) fn start_logging(arguments: &[&str], log: Option<&Path>) -> Self {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_rpfd"));
+        command.stderr(log.map_or_else(Stdio::inherit, |path| std::fs::File::create(path).unwrap().into()));
+        Self::start_by(command, tempfile::tempdir().unwrap(), arguments)
     }
 
     /// One that finds what was in its data folder before.
@@ -49,15 +67,35 @@ impl Server {
             .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
             .arg(folder.path())
             .args(arguments)
-            .env("RUST_LOG", "warn")
+            .env("RUST_LOG", if arguments.contains(&"--log-format") { "info" } else { "warn" })
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let address = line.trim().rsplit("//").next().unwrap().to_owned();
-        assert!(!address.is_empty(), "the service did not start");
-        Self { child, address, folder: Some(folder) }
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let mut address = || lines.next()?.unwrap().rsplit("//").next().map(ToOwned::to_owned);
+        let (first, second) = (address().expect("the service did not start"), arguments.contains(&"--metrics-listen"));
+        let metrics = if second { address().map(|address| address.replace("/metrics", "")) } else { None };
+        Self { child, address: first, metrics, folder: Some(folder) }
+    }
+
+    /// What it counts now.
+    pub(crate) fn metrics(&self) -> String {
+        let mut stream = TcpStream::connect(self.metrics.as_ref().unwrap()).unwrap();
+        stream.write_all(head("GET", "/metrics", &[], 0).as_bytes()).unwrap();
+        let answer = Answer::read(&mut stream);
+        assert_eq!(answer.header("content-type"), Some("application/openmetrics-text; version=1.0.0; charset=utf-8"));
+        String::from_utf8(answer.body).unwrap()
+    }
+
+    /// The value of one of these, with its labels.
+    pub(crate) fn metric(&self, name: &str) -> Option<f64> {
+        let text = self.metrics();
+        text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok())
+    }
+
+    pub(crate) fn signal(&self, name: &str) {
+        let id = self.child.id().to_string();
+        assert!(Command::new("kill").args([name, &id]).status().unwrap().success());
     }
 
     pub(crate) fn data_dir(&self) -> &Path {
@@ -108,9 +146,13 @@ impl Server {
 
     /// The same, and gives what it has left.
     pub(crate) fn terminated(mut self) -> (std::process::ExitStatus, tempfile::TempDir) {
-        let id = self.child.id().to_string();
-        assert!(Command::new("kill").args(["-TERM", &id]).status().unwrap().success());
+        self.signal("-TERM");
         (self.child.wait().unwrap(), self.folder.take().unwrap())
+    }
+
+    /// Says how it ended, when it does.
+    pub(crate) fn ended(mut self) -> std::process::ExitStatus {
+        self.child.wait().unwrap()
     }
 }
 
@@ -139,6 +181,10 @@ impl Answer {
         let mut bytes = Vec::new();
         // A connection that is reset after the answer is as good as one that ends.
         let _ = stream.read_to_end(&mut bytes);
+        Self::parse(bytes)
+    }
+
+    pub(crate) fn parse(mut bytes: Vec<u8>) -> Self {
         let end = bytes.windows(4).position(|w| w == b"\r\n\r\n").expect("an answer");
         let head = String::from_utf8(bytes[..end].to_vec()).unwrap();
         let mut lines = head.lines();
@@ -192,6 +238,28 @@ impl Answer {
         assert!(!problem["detail"].as_str().unwrap().is_empty());
         codes::check_documented(code, status);
         problem
+    }
+}
+
+/// Whether a tool is there; where it must be, it is.
+pub(crate) fn has(tool: &str, argument: &str) -> bool {
+    match Command::new(tool).arg(argument).stdout(Stdio::null()).stderr(Stdio::null()).status() {
+        Ok(_) => true,
+        Err(error) if std::env::var_os("RPFD_CI").is_none() => {
+            eprintln!("skipped: {tool} cannot be run: {error}");
+            false
+        }
+        Err(error) => panic!("{tool} cannot be run: {error}"),
+    }
+}
+
+/// Waits until something is so, for half a minute at most.
+#[track_caller]
+pub(crate) fn wait_until(what: &str, mut so: impl FnMut() -> bool) {
+    let started = std::time::Instant::now();
+    while !so() {
+        assert!(started.elapsed() < Duration::from_secs(30), "in vain: {what}");
+        std::thread::sleep(Duration::from_millis(20));
     }
 }
 

@@ -7,10 +7,11 @@
   rpfd_client.py info IN.tiles                 print every header, and each plane's sum
   rpfd_client.py example OUT.tiles             write a small noisy image in four haloed tiles
 
-Progress and problems go to standard error. Files compressed with zstd are sent as they are ("images" looks into them
+A bearer token is taken from the environment variable RPFD_TOKEN. Progress and problems go to standard error. Files compressed with zstd are sent as they are ("images" looks into them
 first, for which it needs zstandard).
 """
 import json
+import os
 import sys
 import urllib.error
 import urllib.parse
@@ -90,6 +91,8 @@ def call(method, url, body=None):
     headers = {"Content-Type": "application/msgpack"}
     if hasattr(body, "peek") and body.peek(4)[:4] == b"\x28\xb5\x2f\xfd":
         headers["Content-Encoding"] = "zstd"
+    if token := os.environ.get("RPFD_TOKEN"):
+        headers["Authorization"] = f"Bearer {token}"
     try:
         return urllib.request.urlopen(urllib.request.Request(url, body, headers, method=method))
     except urllib.error.HTTPError as error:
