@@ -184,13 +184,17 @@ impl LeftOutReason {
     }
 }
 
-/// Filters a tile.
+/// Filters a tile. With a pool all of it is done there, what is not shared out as well.
 pub fn filter(tile: &SampleTile, method: &Method, execution: &Execution) -> Result<Filtered, Stopped> {
-    match method.algorithm() {
+    let work = || match method.algorithm() {
         method::Algorithm::Unfiltered => baseline::mean::filter(tile, execution),
         method::Algorithm::Gaussian(params) => baseline::window::filter(tile, params, execution),
         method::Algorithm::Bilateral(params) => baseline::window::filter(tile, params, execution),
         method::Algorithm::CrossBilateral(params) => baseline::window::filter(tile, params, execution),
         method::Algorithm::Rpf(params) => rpf::filter(tile, params, execution),
+    };
+    match execution.pool {
+        Some(pool) => pool.install(work),
+        None => work(),
     }
 }

@@ -375,6 +375,9 @@ impl SampleTile {
                     replaced
                 }
                 Plane::Values(values) => {
+                    if clean(values) {
+                        continue;
+                    }
                     let replaced = values.iter().filter(|&&v| bad(v)).count();
                     if replaced > 0 && role == Role::Color {
                         for pixel in 0..self.geometry.window().area() as usize {
@@ -487,28 +490,52 @@ impl SampleTile {
 /// Makes a sample that lacks any component, or whose components are all 0, lack all of them. A component that is constant
 /// may stay so: the others say it.
 fn unite_missing(components: &mut [Plane], samples: usize) {
-    let missing = |components: &[Plane], sample: usize| {
-        let value = |plane: &Plane| match plane {
-            Plane::Constant(value) => *value,
-            Plane::Values(values) => values[sample],
-        };
-        components.iter().any(|plane| value(plane).is_nan()) || components.iter().all(|plane| value(plane) == 0.0)
-    };
     if components.iter().all(|plane| matches!(plane, Plane::Constant(_))) {
-        if missing(components, 0) {
+        let values = || components.iter().map(|plane| if let Plane::Constant(value) = plane { *value } else { 0.0 });
+        if values().any(f32::is_nan) || values().all(|value| value == 0.0) {
             components.fill(Plane::Constant(f32::NAN));
         }
         return;
     }
-    for sample in 0..samples {
-        if missing(components, sample) {
-            for plane in components.iter_mut() {
-                if let Plane::Values(values) = plane {
-                    values[sample] = f32::NAN;
+    // Plane by plane, some samples at a time, so that the loops run in lanes.
+    const AT_ONCE: usize = 256;
+    for start in (0..samples).step_by(AT_ONCE) {
+        let end = samples.min(start + AT_ONCE);
+        let (mut lacking, mut zero) = ([false; AT_ONCE], [true; AT_ONCE]);
+        for plane in &*components {
+            let constant;
+            let values = match plane {
+                Plane::Constant(value) => {
+                    constant = [*value; AT_ONCE];
+                    &constant[..end - start]
+                }
+                Plane::Values(values) => &values[start..end],
+            };
+            for ((lacking, zero), value) in lacking.iter_mut().zip(&mut zero).zip(values) {
+                *lacking |= value.is_nan();
+                *zero &= *value == 0.0;
+            }
+        }
+        for plane in components.iter_mut() {
+            if let Plane::Values(values) = plane {
+                for ((value, lacking), zero) in values[start..end].iter_mut().zip(&lacking).zip(&zero) {
+                    *value = if lacking | zero { f32::NAN } else { *value };
                 }
             }
         }
     }
+}
+
+/// Whether all values are finite, and none is -0: in one pass, as most are.
+fn clean(values: &[f32]) -> bool {
+    const INFINITY: u32 = f32::INFINITY.to_bits();
+    const NEGATIVE_ZERO: u32 = 1 << 31;
+    values.chunks(4096).all(|values| {
+        let odd = values.iter().map(|v| v.to_bits()).fold(0, |odd: u32, bits| {
+            odd | u32::from(bits & !NEGATIVE_ZERO >= INFINITY) | u32::from(bits == NEGATIVE_ZERO)
+        });
+        odd == 0
+    })
 }
 
 /// Replaces what is not finite by the mean of what is, or by 0.
