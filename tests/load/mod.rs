@@ -99,7 +99,7 @@ fn memory_is_bounded_under_load() {
     }
 }
 
-/// Filtering tiles of 256 x 256 over HTTP, at most a tenth of the service's CPU time is spent outside of the filter.
+/// Filtering tiles of 256 x 256 over HTTP, little of the service's CPU time is spent outside of the filter.
 #[test]
 fn little_time_is_spent_outside_of_the_filter() {
     let server = Server::start(&["--threads", "2"]);
