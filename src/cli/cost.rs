@@ -3,7 +3,6 @@
 use super::{args::SimdArgs, failure::Failure, input::Input, progress, report::named};
 use crate::{
     filter::{Execution, Method, Rect, Role, SampleTile, SimdLevel, TileGeometry},
-    picture::PictureError,
     report::{
         cost::{Axis, Cost, Costs, Grid, Point, Task, input, levels, measure, memory, show},
         machine::Machine,
@@ -11,7 +10,7 @@ use crate::{
     stitch::atomic::AtomicFile,
     store::spool::Spool,
 };
-use std::{io::Write, path::PathBuf};
+use std::path::PathBuf;
 
 /// Measure what filtering costs, and how that grows
 ///
@@ -171,12 +170,7 @@ fn task(tile: &SampleTile, file: &Input, label: &str, simd: SimdLevel) -> Task {
 fn write(args: &Args, costs: &Costs, outputs: [Option<AtomicFile>; 2]) -> Result<(), Failure> {
     let json = || format!("{:#}\n", show::json(costs));
     let contents: [&dyn Fn() -> String; 2] = [&json, &|| show::svg(&costs.costs)];
-    for (file, content) in outputs.into_iter().zip(contents) {
-        let Some(mut file) = file else { continue };
-        let written = file.out().write_all(content().as_bytes());
-        written.map_err(|error| Failure::from(PictureError::Io(error)))?;
-        file.commit()?;
-    }
+    crate::cli::write_texts(outputs, contents)?;
     if args.json_errors() {
         say!("{}", json().trim_end());
         return Ok(());

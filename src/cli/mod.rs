@@ -28,9 +28,10 @@ mod stability;
 mod synth;
 mod token;
 
+use crate::{picture::PictureError, stitch::atomic::AtomicFile};
 use clap::Parser;
 use failure::{Failure, FailureKind};
-use std::process::ExitCode;
+use std::{io::Write, process::ExitCode};
 
 /// Streaming, tile-based denoising of Monte Carlo renders by Random Parameter Filtering.
 #[derive(Parser)]
@@ -87,11 +88,25 @@ pub fn main() -> ExitCode {
 }
 
 fn say(line: std::fmt::Arguments) {
-    use std::io::{ErrorKind, Write};
+    use std::io::ErrorKind;
     if let Err(error) = writeln!(std::io::stdout().lock(), "{line}")
         && error.kind() != ErrorKind::BrokenPipe
     {
         eprintln!("rpfd: standard output: {error} (output_io)");
         std::process::exit(1);
     }
+}
+
+/// Writes the text files that are wanted, each whole or not at all.
+fn write_texts<const N: usize>(
+    outputs: [Option<AtomicFile>; N],
+    contents: [&dyn Fn() -> String; N],
+) -> Result<(), Failure> {
+    for (file, content) in outputs.into_iter().zip(contents) {
+        let Some(mut file) = file else { continue };
+        let written = file.out().write_all(content().as_bytes());
+        written.map_err(|error| Failure::from(PictureError::Io(error)))?;
+        file.commit()?;
+    }
+    Ok(())
 }

@@ -27,6 +27,7 @@
 //! | sigma_8^2 | [`rpf::Params::sigma8_squared`] |
 
 pub mod baseline;
+pub mod channels;
 pub mod coverage;
 mod finish;
 pub mod geometry;
@@ -40,11 +41,12 @@ pub mod scalar;
 mod share;
 mod work;
 
+pub use channels::{Channel, ChannelSet, Role};
 pub use coverage::Coverage;
 pub use geometry::{Halo, Rect, TileGeometry};
 pub use lanes::{SimdLevel, SimdLevelError};
 pub use method::{Method, ParameterError};
-pub use samples::{Channel, ChannelSet, Counts, Plane, Role, SampleTile};
+pub use samples::{Counts, Plane, SampleTile};
 pub use work::Work;
 
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -26,6 +26,7 @@ mod regions;
 mod registry;
 mod results;
 mod routes;
+mod schemas;
 mod stream;
 mod trace;
 mod work;

@@ -1,10 +1,6 @@
 //! What can be wrong with a stream of bytes, where, and what would be right.
 
-use crate::filter::{
-    Rect,
-    geometry::GeometryError,
-    samples::{ChannelError, SampleError},
-};
+use crate::filter::{Rect, channels::ChannelError, geometry::GeometryError, samples::SampleError};
 
 /// A stream that cannot be read: what is wrong with it, and where.
 #[derive(Clone, Debug, PartialEq)]

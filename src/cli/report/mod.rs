@@ -5,7 +5,6 @@ mod data;
 use super::{args::SimdArgs, failure::Failure, progress};
 use crate::{
     filter::{Execution, Method, Rect, SampleTile, SimdLevel, method::PRESETS},
-    picture::PictureError,
     report::{
         cost::{self, Costs},
         html::{Page, page},
@@ -23,7 +22,6 @@ use data::{DataArg, DataSet, SynthArg, Wanted};
 use indicatif::ProgressBar;
 use std::{
     collections::BTreeMap,
-    io::Write,
     path::{Path, PathBuf},
     sync::atomic::AtomicBool,
 };
@@ -421,12 +419,7 @@ fn write(
         rows.iter().filter(|row| !row.key.part || rows.iter().all(|row| row.key.part)).cloned().collect();
     let plots = || svg::draw(&plots::error_time(&plotted), 3);
     let contents: [&dyn Fn() -> String; 4] = [&json, &|| table::csv(rows, seconds_per_sample), &html, &plots];
-    for (file, content) in outputs.into_iter().zip(contents) {
-        let Some(mut file) = file else { continue };
-        let written = file.out().write_all(content().as_bytes());
-        written.map_err(|error| Failure::from(PictureError::Io(error)))?;
-        file.commit()?;
-    }
+    crate::cli::write_texts(outputs, contents)?;
     if args.json_errors() {
         print!("{}", json());
         return Ok(());
