@@ -166,7 +166,7 @@ pub fn sample_total(pixels: u64, counts: &Counts) -> Result<u64, SampleError> {
 impl SampleTile {
     /// Checks the shape and makes the values finite, in place: a colour that is not finite becomes the mean of its
     /// pixel's finite samples in that channel (0 if there is none); NaN in a feature stays and means "none", and so does
-    /// 0 where it can only mean that ([`Channel::zero_is_missing`]); anything else that is not finite becomes 0.
+    /// 0 where it can only mean that ([`super::Channel::zero_is_missing`]); anything else that is not finite becomes 0.
     ///
     /// `planes` are in the order of [`ChannelSet::plane_channels`], each with one value per sample of the data window.
     pub fn new(
