@@ -158,7 +158,8 @@ fn images_that_nobody_uses_expire() {
     // The list is no use of them.
     wait_for("the image to expire", || server.get("/v1/images").json()["images"] == json!([]));
     server.get("/v1/images/a").problem(404, "unknown_image");
-    assert_eq!(std::fs::read_dir(server.data_dir().join("images")).unwrap().count(), 0);
+    // It is forgotten first, and its files are removed then.
+    wait_for("its files to be gone", || std::fs::read_dir(server.data_dir().join("images")).unwrap().count() == 0);
 }
 
 #[test]
