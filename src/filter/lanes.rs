@@ -28,6 +28,9 @@ pub(crate) type Words<S> = fearless_simd::u64x8<S>;
 /// Sixteen lanes of signed 32 bits.
 pub(crate) type Signed<S> = fearless_simd::i32x16<S>;
 
+/// A truth value for each of sixteen lanes.
+pub(crate) type Mask<S> = fearless_simd::mask32x16<S>;
+
 /// Sixteen lanes of 32 bits.
 pub(crate) type Integers<S> = fearless_simd::u32x16<S>;
 
@@ -114,23 +117,35 @@ pub(crate) fn sum<S: Simd>(lanes: Lanes<S>) -> f32 {
     (last[0] + last[2]) + (last[1] + last[3])
 }
 
-/// Lanes of half a vector: what is transposed at a time, since AVX2 has registers for no more.
+/// Lanes of half a vector: rows that are transposed at a time, since AVX2 has registers for no more.
 pub(crate) const HALF: usize = LANES / 2;
 
 /// Half a vector.
 pub(crate) type Half<S> = fearless_simd::f32x8<S>;
 
-/// Rows become columns: lane `i` of vector `j` becomes lane `j` of vector `i`.
+/// Columns that are transposed at a time.
+pub(crate) const QUARTER: usize = LANES / 4;
+
+/// A quarter of a vector.
+pub(crate) type Quarter<S> = fearless_simd::f32x4<S>;
+
+/// Rows become columns: lane `i` of row `j` becomes lane `j` of vector `i`.
 #[inline(always)]
-pub(crate) fn transpose<S: Simd>(vectors: &mut [Half<S>; HALF]) {
-    // A perfect shuffle moves the highest bit of the vector's number to the lowest of the lane's, and the highest of the
-    // lane's to the lowest of the vector's; three of them exchange the two.
-    for _ in 0..HALF.ilog2() {
-        let old = *vectors;
-        for i in 0..HALF / 2 {
-            (vectors[2 * i], vectors[2 * i + 1]) = old[i].interleave(old[i + HALF / 2]);
-        }
-    }
+pub(crate) fn transpose<S: Simd>(rows: [Quarter<S>; HALF]) -> [Half<S>; QUARTER] {
+    // Rows 4 apart lie in the two halves of a vector, so that nothing crosses from one half to the other.
+    let [a, b, c, d, e, f, g, h] = rows;
+    let (a, b, c, d) = (a.combine(e), b.combine(f), c.combine(g), d.combine(h));
+    let ((ac, ac_high), (bd, bd_high)) = (interleave_quarters(a, c), interleave_quarters(b, d));
+    let ((first, second), (third, fourth)) = (interleave_quarters(ac, bd), interleave_quarters(ac_high, bd_high));
+    [first, second, third, fourth]
+}
+
+/// The values of two vectors by turns, quarter by quarter: of their low halves, and of their high halves.
+#[inline(always)]
+fn interleave_quarters<S: Simd>(a: Half<S>, b: Half<S>) -> (Half<S>, Half<S>) {
+    let (low, high) = a.interleave(b);
+    let ((low, low_rest), (high, high_rest)) = (low.split(), high.split());
+    (low.combine(high), low_rest.combine(high_rest))
 }
 
 /// Lanes below `n` are kept, the others become 0.
@@ -145,7 +160,7 @@ pub(crate) fn keep_first<S: Simd>(simd: S, lanes: Lanes<S>, n: usize) -> Lanes<S
 /// Lanes whose bit is set are of `a`, the others of `b`.
 #[inline(always)]
 pub(crate) fn select_lanes<S: Simd>(simd: S, bits: u64, a: Lanes<S>, b: Lanes<S>) -> Lanes<S> {
-    fearless_simd::mask32x16::from_bitmask(simd, bits).select(a, b)
+    Mask::from_bitmask(simd, bits).select(a, b)
 }
 
 /// Beyond this, [`exp_neg`] is 0: e^-80 is 1.8e-35.

@@ -12,7 +12,8 @@ pub struct Work {
     pub planes: u64,
     /// Left out for columns that are constant over a neighbourhood, though not over the tile.
     pub columns: u64,
-    /// Left out for differences in columns that weigh nothing: features with beta 0, colours with alpha 0.
+    /// Left out for differences that add nothing: in columns that weigh nothing (features with beta 0, colours with alpha
+    /// 0), and in those that are constant over a neighbourhood.
     pub distances: u64,
 }
 

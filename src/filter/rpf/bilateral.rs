@@ -71,8 +71,12 @@ fn filter_block<S: Simd, const N: usize, const C: usize>(
             let values = Lanes::from_slice(simd, &column[start..start + LANES]);
             for (n, &own) in column[first..first + N].iter().enumerate() {
                 let difference = values - Lanes::splat(simd, own);
-                squares[n] = difference * difference;
-                distance[n] += squares[n];
+                let square = difference * difference;
+                distance[n] += square;
+                // Kept only where it may be wanted: registers are few.
+                if C == 1 {
+                    squares[n] = square;
+                }
             }
         }
         for _ in 0..again {

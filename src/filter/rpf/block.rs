@@ -5,7 +5,7 @@
 //! cache while the block is worked on: a candidate is tested, and a row gathered, from one or two lines of memory.
 
 use super::relevance::{Relevant, Source};
-use crate::filter::lanes::{HALF, Half, LANES, Simd, prelude::*, transpose};
+use crate::filter::lanes::{HALF, LANES, QUARTER, Quarter, Simd, prelude::*, transpose};
 use crate::filter::samples::SampleLayout;
 use crate::filter::{Plane, Rect, SampleTile};
 
@@ -180,11 +180,19 @@ impl Block {
         }
     }
 
-    /// R, G and B of some samples, as columns.
+    /// R, G and B of some samples, as columns. The number of rows is a whole number of lanes.
     #[inline(always)]
-    pub(crate) fn gather_colors(&self, rows: &[u32], [red, green, blue]: [&mut [f32]; 3]) {
-        for (((row, red), green), blue) in rows.iter().zip(red).zip(green).zip(blue) {
-            [*red, *green, *blue, _] = self.colors[*row as usize];
+    pub(crate) fn gather_colors<S: Simd>(&self, simd: S, rows: &[u32], channels: [&mut [f32]; 3]) {
+        let [red, green, blue] = channels.map(|channel| channel.as_chunks_mut::<HALF>().0);
+        for (((rows, red), green), blue) in rows.as_chunks::<HALF>().0.iter().zip(red).zip(green).zip(blue) {
+            let mut colors = [Quarter::splat(simd, 0.0); HALF];
+            for (color, &row) in colors.iter_mut().zip(rows) {
+                *color = Quarter::from_slice(simd, &self.colors[row as usize]);
+            }
+            let [r, g, b, _] = transpose(colors);
+            r.store_slice(red);
+            g.store_slice(green);
+            b.store_slice(blue);
         }
     }
 
@@ -223,21 +231,27 @@ fn copy_row<S: Simd>(
         for start in samples.clone().step_by(HALF) {
             let count = HALF.min(samples.end - start);
             for part in (0..LANES).step_by(HALF) {
-                let mut values = [Half::splat(simd, 0.0); HALF];
-                for (place, plane) in values.iter_mut().zip(&planes[part..part + HALF]) {
-                    *place = match plane {
-                        Plane::Constant(value) => Half::splat(simd, *value),
-                        Plane::Values(values) if count == HALF => Half::from_slice(simd, &values[start..start + HALF]),
+                let mut values = [[Quarter::splat(simd, 0.0); HALF]; 2];
+                for (k, plane) in planes[part..part + HALF].iter().enumerate() {
+                    let mut few = [0.0; HALF];
+                    let run = match plane {
+                        Plane::Constant(value) => {
+                            (values[0][k], values[1][k]) = (Quarter::splat(simd, *value), Quarter::splat(simd, *value));
+                            continue;
+                        }
+                        Plane::Values(values) if count == HALF => &values[start..start + HALF],
                         Plane::Values(values) => {
-                            let mut few = [0.0; HALF];
                             few[..count].copy_from_slice(&values[start..start + count]);
-                            Half::from_slice(simd, &few)
+                            &few
                         }
                     };
+                    values[0][k] = Quarter::from_slice(simd, &run[..QUARTER]);
+                    values[1][k] = Quarter::from_slice(simd, &run[QUARTER..]);
                 }
-                transpose(&mut values);
+                let [first_half, second_half] = values;
+                let values = [transpose(first_half), transpose(second_half)];
                 let place = records[(first + start - samples.start) * lines + line..].iter_mut().step_by(lines);
-                for (record, value) in place.zip(&values[..count]) {
+                for (record, value) in place.zip(&values.as_flattened()[..count]) {
                     value.store_slice(&mut record.0[part..part + HALF]);
                 }
             }
@@ -245,21 +259,29 @@ fn copy_row<S: Simd>(
     }
 }
 
-/// Records as columns, 8 rows by 8 columns at a time.
+/// Records as columns, 8 rows by 4 columns at a time.
 #[inline(always)]
 fn gather_columns<S: Simd>(simd: S, records: &[Line], lines: usize, rows: &[u32], columns: &mut [f32], stride: usize) {
+    let (rows, _) = rows.as_chunks::<HALF>();
     for line in 0..lines {
-        let columns = &mut columns[line * LANES * stride..][..LANES * stride];
-        for (chunk, rows) in rows.chunks_exact(HALF).enumerate() {
-            for part in (0..LANES).step_by(HALF) {
-                let mut values = [Half::splat(simd, 0.0); HALF];
-                for (place, &row) in values.iter_mut().zip(rows) {
-                    let record = &records[row as usize * lines + line].0;
-                    *place = Half::from_slice(simd, &record[part..part + HALF]);
+        for part in (0..LANES).step_by(HALF) {
+            let first = (line * LANES + part) * stride;
+            let mut columns = columns[first..first + HALF * stride].chunks_exact_mut(stride);
+            let mut next = || columns.next().map(|column| &mut column.as_chunks_mut::<HALF>().0[..rows.len()]);
+            let places = [(); HALF].map(|()| next().unwrap_or_default());
+            let [a, b, c, d, e, f, g, h] = places;
+            let places = a.iter_mut().zip(b).zip(c).zip(d).zip(e).zip(f).zip(g).zip(h);
+            for (rows, (((((((a, b), c), d), e), f), g), h)) in rows.iter().zip(places) {
+                let mut values = [[Quarter::splat(simd, 0.0); HALF]; 2];
+                for (i, &row) in rows.iter().enumerate() {
+                    let record = &records[row as usize * lines + line].0[part..part + HALF];
+                    values[0][i] = Quarter::from_slice(simd, &record[..QUARTER]);
+                    values[1][i] = Quarter::from_slice(simd, &record[QUARTER..]);
                 }
-                transpose(&mut values);
-                for (value, column) in values.iter().zip(columns[part * stride..].chunks_exact_mut(stride)) {
-                    value.store_slice(&mut column[chunk * HALF..][..HALF]);
+                for (values, places) in values.into_iter().zip([[a, b, c, d], [e, f, g, h]]) {
+                    for (value, place) in transpose(values).into_iter().zip(places) {
+                        value.store_slice(place);
+                    }
                 }
             }
         }

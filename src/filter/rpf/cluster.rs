@@ -8,7 +8,7 @@
 use super::block::{Block, Line};
 use super::params::Params;
 use super::relevance::Feature;
-use crate::filter::lanes::{Integers, LANES, Lanes, Simd, Wide, prelude::*, select_lanes};
+use crate::filter::lanes::{Integers, LANES, Lanes, Mask, Simd, Wide, prelude::*, select_lanes};
 
 /// The features that a neighbourhood's candidates may have: for each line of a record, the ends of 16 intervals.
 #[derive(Debug)]
@@ -67,18 +67,16 @@ impl Cluster {
         let (features, lines) = (block.features(), self.lines.len());
         // No branch on what is inside: it could not be foretold.
         if let [interval] = &self.lines[..] {
-            let (low, high) = (Lanes::from_slice(simd, &interval.low.0), Lanes::from_slice(simd, &interval.high.0));
+            let bounds = Bounds::of(simd, interval);
             if interval.missing == 0 {
                 for &record in records {
-                    let values = Lanes::from_slice(simd, &features[record as usize].0);
                     rows[kept] = record;
-                    kept += usize::from(inside(values, low, high, 0));
+                    kept += usize::from(bounds.hold(Lanes::from_slice(simd, &features[record as usize].0), false));
                 }
             } else {
                 for &record in records {
-                    let values = Lanes::from_slice(simd, &features[record as usize].0);
                     rows[kept] = record;
-                    kept += usize::from(inside(values, low, high, interval.missing));
+                    kept += usize::from(bounds.hold(Lanes::from_slice(simd, &features[record as usize].0), true));
                 }
             }
             return kept;
@@ -86,8 +84,7 @@ impl Cluster {
         for &record in records {
             let mut all = true;
             for (interval, features) in self.lines.iter().zip(&features[record as usize * lines..]) {
-                let (low, high) = (Lanes::from_slice(simd, &interval.low.0), Lanes::from_slice(simd, &interval.high.0));
-                all &= inside(Lanes::from_slice(simd, &features.0), low, high, interval.missing);
+                all &= Bounds::of(simd, interval).hold(Lanes::from_slice(simd, &features.0), true);
             }
             rows[kept] = record;
             kept += usize::from(all);
@@ -142,14 +139,27 @@ impl Interval {
     }
 }
 
-/// Whether 16 features are inside, or missing where they may be.
-#[inline(always)]
-fn inside<S: Simd>(values: Lanes<S>, low: Lanes<S>, high: Lanes<S>, missing: u64) -> bool {
-    let inside = (values.simd_ge(low) & values.simd_le(high)).to_bitmask();
-    if missing == 0 {
-        return inside == ALL;
+/// An [`Interval`] in lanes.
+struct Bounds<S: Simd> {
+    low: Lanes<S>,
+    high: Lanes<S>,
+    missing: Mask<S>,
+}
+
+impl<S: Simd> Bounds<S> {
+    #[inline(always)]
+    fn of(simd: S, interval: &Interval) -> Self {
+        let Interval { low, high, missing } = interval;
+        let (low, high) = (Lanes::from_slice(simd, &low.0), Lanes::from_slice(simd, &high.0));
+        Self { low, high, missing: Mask::from_bitmask(simd, *missing) }
     }
-    inside | (!values.simd_eq(values)).to_bitmask() & missing == ALL
+
+    /// Whether 16 features are inside, or, if any `may_miss`, missing where they may be.
+    #[inline(always)]
+    fn hold(&self, values: Lanes<S>, may_miss: bool) -> bool {
+        let inside = values.simd_ge(self.low) & values.simd_le(self.high);
+        if may_miss { (inside | !values.simd_eq(values) & self.missing).all_true() } else { inside.all_true() }
+    }
 }
 
 /// A bit for each lane.

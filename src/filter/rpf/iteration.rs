@@ -60,9 +60,11 @@ pub(crate) struct Scratch {
     histograms: Histograms,
     pub(super) dependencies: Dependencies,
     pub(crate) weights: Weights,
-    /// The columns that weigh anything, and their factors.
+    /// The columns that weigh anything, and their factors; of those that are filtered by, only the ones that vary.
     pub(super) active: Vec<usize>,
     factors: Vec<f32>,
+    /// How many columns weigh anything, each counted once.
+    pub(super) loaded: usize,
     /// What was done and left out in core pixels.
     pub(super) work: Work,
     /// Values that the spike step replaced in core pixels.
@@ -88,6 +90,7 @@ impl Scratch {
             weights: Weights::new(features.len()),
             active: Vec::with_capacity(features.len() + 3),
             factors: Vec::with_capacity(features.len() + 3),
+            loaded: 0,
             work: Work::default(),
             spikes: 0,
             order,
@@ -212,7 +215,7 @@ impl Pass<'_> {
         let (red, rest) = radiance.split_at_mut(*stride);
         let (green, blue) = rest.split_at_mut(*stride);
         let [red, green, blue] = [red, green, blue].map(|channel| &mut channel[..rows.len()]);
-        block.gather_colors(rows, [&mut *red, &mut *green, &mut *blue]);
+        block.gather_colors(simd, rows, [&mut *red, &mut *green, &mut *blue]);
         make_safe(simd, &mut [red, green, blue])
     }
 
@@ -402,19 +405,26 @@ impl Pass<'_> {
                 factors.push(factor);
             }
         }
-        let (active, factors) = (std::mem::take(active), std::mem::take(factors));
+        let (mut active, factors) = (std::mem::take(active), std::mem::take(factors));
         if fresh {
             let features = active.partition_point(|&column| column < scratch.order.features.end);
             let (batches, rest) = active[..features].as_chunks::<BATCH>();
             let (factor_batches, factor_rest) = factors[..features].as_chunks::<BATCH>();
             for (batch, factors) in batches.iter().zip(factor_batches) {
-                scratch.normalise(simd, *batch, factors);
+                let spans = scratch.normalise(simd, *batch, factors);
+                for (&column, span) in batch.iter().zip(spans) {
+                    scratch.constant[column] = span.constant();
+                }
             }
-            for (column, factor) in rest.iter().zip(factor_rest) {
-                scratch.normalise(simd, [*column], &[*factor]);
+            for (&column, &factor) in rest.iter().zip(factor_rest) {
+                let [span] = scratch.normalise(simd, [column], &[factor]);
+                scratch.constant[column] = span.constant();
             }
             if features < active.len() {
                 scratch.normalise_colors(simd, self.relevant.twins(), spans, &scratch.weights.color.map(factor));
+                for (column, span) in scratch.order.colors.clone().zip(spans) {
+                    scratch.constant[column] = span.constant();
+                }
             }
         } else {
             for (index, (&column, factor)) in active.iter().zip(&factors).enumerate() {
@@ -424,6 +434,11 @@ impl Pass<'_> {
                 let [values] = scratch.columns([column]);
                 values.iter_mut().for_each(|v| *v *= factor);
             }
+        }
+        scratch.loaded = active.iter().enumerate().filter(|(i, column)| !active[..*i].contains(column)).count();
+        // Nor do the differences in a column that is constant here add anything.
+        if self.execution.leave_out {
+            active.retain(|&column| !scratch.constant[column]);
         }
         (scratch.active, scratch.factors) = (active, factors);
     }

@@ -9,16 +9,18 @@ use super::block::Block;
 use super::cluster::Cluster;
 use super::random;
 use crate::filter::geometry::Rect;
-use crate::filter::lanes::Simd;
+use crate::filter::lanes::{Integers, LANES, Simd, prelude::*};
 use crate::filter::samples::SampleLayout;
 use std::ops::Range;
 
 /// Tries within one draw before it is dropped.
 const TRIES: u64 = 8;
 /// Draws whose bits are made at once.
-const DRAWS: usize = 64;
+const DRAWS: usize = 32;
 /// Slots of the alias table: a power of two above the widest box.
 const SLOTS: usize = 256;
+/// Parts of a slot that have an offset each, unless the two that the slot stands for meet there.
+const PARTS: usize = 16;
 
 /// Offsets along one axis: a Gaussian with sigma = box / 4, rounded to whole pixels and held inside the box, as a table
 /// for Walker's alias method in Vose's form (1991). The two axes are independent, so one table serves both.
@@ -26,7 +28,12 @@ const SLOTS: usize = 256;
 pub struct Offsets {
     /// Of each slot: the share (of 65536) in which it stands for `own`, else for `other`.
     slots: Box<[Slot; SLOTS]>,
+    /// The offset of each part of each slot, `[part][slot]`, where it is one: nearly everywhere.
+    parts: Box<[i8; PARTS * SLOTS]>,
 }
+
+/// In place of the offset of a part that has two.
+const EITHER: i8 = i8::MIN;
 
 #[derive(Clone, Copy, Debug, Default)]
 struct Slot {
@@ -59,17 +66,40 @@ impl Offsets {
         for full in small.into_iter().chain(large) {
             slots[full] = Slot { share: 65536, offsets: [offset(full); 2] };
         }
-        Self { slots }
+        let mut parts = Box::new([EITHER; PARTS * SLOTS]);
+        for (index, place) in parts.iter_mut().enumerate() {
+            let (slot, start) = (slots[index % SLOTS], (index / SLOTS * 65536 / PARTS) as u32);
+            let [other, own] = slot.offsets;
+            let end = start + (65536 / PARTS) as u32;
+            *place = if slot.share <= start {
+                other as i8
+            } else if slot.share >= end {
+                own as i8
+            } else {
+                *place
+            };
+        }
+        Self { slots, parts }
+    }
+
+    /// Where [`Offsets::parts`] has the offset for 24 random bits: their slot, and the first bits of their fraction.
+    #[inline(always)]
+    const fn part(bits: u64) -> u16 {
+        (bits & 0xFF | bits >> 12 & 0xF00) as u16
+    }
+
+    /// The offset that a part has, or [`EITHER`].
+    #[inline(always)]
+    fn of_part(&self, part: u16) -> u32 {
+        i32::from(self.parts[usize::from(part) % (PARTS * SLOTS)]) as u32
     }
 
     /// The offsets in x and y for 48 random bits.
-    #[inline(always)]
     fn both(&self, bits: u64) -> (i32, i32) {
         (self.pick(bits), self.pick(bits >> 24))
     }
 
     /// The offset for 24 random bits.
-    #[inline(always)]
     fn pick(&self, bits: u64) -> i32 {
         let slot = &self.slots[bits as usize % SLOTS];
         let fraction = (bits >> 8) as u32 & 0xFFFF;
@@ -122,74 +152,125 @@ pub(crate) fn gather_rows<S: Simd>(
     let draws = center.wanted.saturating_sub(kept) as u64;
     for first in (0..draws).step_by(DRAWS) {
         let last = draws.min(first + DRAWS as u64);
-        let drawn = match block.layout() {
-            SampleLayout::Uniform { per_pixel, .. } => draw(
-                image,
-                block.window(),
-                offsets,
-                center,
-                first..last,
-                #[inline(always)]
-                |pixel| (pixel as u32 * per_pixel, *per_pixel),
-                &mut drawn,
-            ),
-            SampleLayout::Varying { starts } => draw(
-                image,
-                block.window(),
-                offsets,
-                center,
-                first..last,
-                #[inline(always)]
-                |pixel| (starts[pixel], starts[pixel + 1] - starts[pixel]),
-                &mut drawn,
-            ),
-        };
-        kept = cluster.keep(simd, block, drawn, rows, kept);
+        let count = draw(simd, image, block, offsets, center, first..last, &mut drawn);
+        kept = cluster.keep(simd, block, &drawn[..count], rows, kept);
     }
     kept
 }
 
-/// Makes some of a pixel's draws; says which records they end at. `samples` has the first record, and the number of
-/// records, of a pixel.
+/// Makes some of a pixel's draws, [`DRAWS`] at most; `drawn` then starts with the records they end at, and they are so
+/// many.
 #[inline(always)]
-fn draw<'a>(
+fn draw<S: Simd>(
+    simd: S,
+    image: &Rect,
+    block: &Block,
+    offsets: &Offsets,
+    center: &Center,
+    draws: Range<u64>,
+    drawn: &mut [u32; DRAWS],
+) -> usize {
+    let Pixels { pixels, picks, mut missed } = draw_pixels(simd, image, block.window(), offsets, center, draws.clone());
+    let count = (draws.end - draws.start) as usize;
+    let places = drawn.iter_mut().zip(pixels.iter().zip(&picks));
+    match block.layout() {
+        SampleLayout::Uniform { per_pixel, .. } => {
+            for (place, (&pixel, &pick)) in places {
+                *place = pixel * per_pixel + pick_of(pick, *per_pixel);
+            }
+        }
+        SampleLayout::Varying { starts } => {
+            for (draw, (place, (&pixel, &pick))) in places.enumerate().take(count) {
+                let (start, end) = (starts[pixel as usize], starts[pixel as usize + 1]);
+                *place = start + pick_of(pick, end - start);
+                missed |= u64::from(start == end) << draw;
+            }
+        }
+    }
+    if missed == 0 {
+        return count;
+    }
+    let mut kept = 0;
+    for draw in (0..count).filter(|draw| missed >> draw & 1 == 0) {
+        drawn[kept] = drawn[draw];
+        kept += 1;
+    }
+    kept
+}
+
+/// What some draws end at.
+struct Pixels {
+    /// Pixels (indices in the data window).
+    pixels: [u32; DRAWS],
+    /// Random bits to pick one of their samples by.
+    picks: [u32; DRAWS],
+    /// A bit for each draw that ends nowhere.
+    missed: u64,
+}
+
+/// The pixels that some draws end at.
+#[inline(always)]
+fn draw_pixels<S: Simd>(
+    simd: S,
     image: &Rect,
     window: &Rect,
     offsets: &Offsets,
     center: &Center,
     draws: Range<u64>,
-    samples: impl Fn(usize) -> (u32, u32),
-    drawn: &'a mut [u32; DRAWS],
-) -> &'a [u32] {
-    let (mut bits, mut picks) = ([0; DRAWS], [0; DRAWS]);
-    for (index, (bits, pick)) in bits.iter_mut().zip(&mut picks).enumerate() {
-        *bits = random::bits(center.key, (draws.start + index as u64) * TRIES);
-        *pick = random::mix(*bits) >> 32;
+) -> Pixels {
+    let (mut pixels, mut picks) = ([0; DRAWS], [0; DRAWS]);
+    let count = (draws.end - draws.start) as usize;
+    let (mut bits, mut parts) = ([0; DRAWS], [[0; DRAWS]; 2]);
+    let (mut dx, mut dy) = ([0; DRAWS], [0; DRAWS]);
+    // All of them, wanted or not: a fixed number of them the compiler puts into lanes.
+    for index in 0..DRAWS {
+        bits[index] = random::bits(center.key, (draws.start + index as u64) * TRIES);
+        picks[index] = (random::mix(bits[index]) >> 32) as u32;
+        (parts[0][index], parts[1][index]) = (Offsets::part(bits[index]), Offsets::part(bits[index] >> 24));
     }
-    let (x, y) = (center.x - window.x, center.y - window.y);
-    let mut count = 0;
-    for (draw, (&bits, &pick)) in draws.zip(bits.iter().zip(&picks)) {
-        let (dx, dy) = offsets.both(bits);
-        let (x, y) = (x.wrapping_add_signed(dx), y.wrapping_add_signed(dy));
-        let (pixel, pick) = if (x < window.width) & (y < window.height) & (dx | dy != 0) {
-            (y as usize * window.width as usize + x as usize, pick)
-        } else if let Some((pixel, bits)) = candidate(image, window, offsets, center, draw) {
-            (pixel, random::mix(bits) >> 32)
-        } else {
-            continue;
-        };
-        let (start, number) = samples(pixel);
-        drawn[count % DRAWS] = start + ((pick * u64::from(number)) >> 32) as u32;
-        count += usize::from(number > 0);
+    for index in 0..DRAWS {
+        (dx[index], dy[index]) = (offsets.of_part(parts[0][index]), offsets.of_part(parts[1][index]));
     }
-    &drawn[..count]
+    // The first try, which mostly is the last, in lanes.
+    let (x, y) = (lanes(simd, center.x - window.x), lanes(simd, center.y - window.y));
+    let (width, height) = (lanes(simd, window.width), lanes(simd, window.height));
+    let (none, either) = (lanes(simd, 0), lanes(simd, i32::from(EITHER) as u32));
+    let mut done = 0;
+    for start in (0..DRAWS).step_by(LANES) {
+        let dx = Integers::from_slice(simd, &dx[start..start + LANES]);
+        let dy = Integers::from_slice(simd, &dy[start..start + LANES]);
+        let (x, y) = (x + dx, y + dy);
+        let undone = dx.simd_eq(either) | dy.simd_eq(either) | (dx | dy).simd_eq(none);
+        let here = x.simd_lt(width) & y.simd_lt(height) & !undone;
+        here.select(y * width + x, none).store_slice(&mut pixels[start..start + LANES]);
+        done |= here.to_bitmask() << start;
+    }
+    let (mut undone, mut missed) = (!done & u64::MAX >> (u64::BITS as usize - count), 0);
+    while undone != 0 {
+        let draw = undone.trailing_zeros() as usize;
+        undone &= undone - 1;
+        match candidate(image, window, offsets, center, draws.start + draw as u64) {
+            Some((pixel, bits)) => (pixels[draw], picks[draw]) = (pixel as u32, (random::mix(bits) >> 32) as u32),
+            None => missed |= 1 << draw,
+        }
+    }
+    Pixels { pixels, picks, missed }
+}
+
+#[inline(always)]
+fn lanes<S: Simd>(simd: S, value: u32) -> Integers<S> {
+    Integers::splat(simd, value)
+}
+
+/// One of so many, for 32 random bits.
+#[inline(always)]
+const fn pick_of(bits: u32, number: u32) -> u32 {
+    ((bits as u64 * number as u64) >> 32) as u32
 }
 
 /// A uniformly random one of a pixel's samples, for the bits that chose the pixel.
-#[inline(always)]
 pub(super) fn pick_sample(bits: u64, samples: &Range<usize>) -> u32 {
-    let chosen = ((random::mix(bits) >> 32) * samples.len() as u64) >> 32;
-    (samples.start as u64 + chosen) as u32
+    samples.start as u32 + pick_of((random::mix(bits) >> 32) as u32, samples.len() as u32)
 }
 
 /// The pixel (index in the data window) that a draw ends at, and its bits; none if all tries fail, or if it ends where

@@ -107,9 +107,9 @@ impl Pass<'_> {
         let own = self.tile.samples_of(self.tile.geometry().window().index(x, y)).len() as u64;
         let rows = scratch.count as u64;
         // A column that is there twice is loaded once; compared too, if it is that of a grey scene.
-        let active = &scratch.active;
-        let loaded = active.iter().enumerate().filter(|(i, column)| !active[..*i].contains(column)).count() as u64;
-        let compared = if kept.colors == 1 { loaded } else { active.len() as u64 };
+        let (active, loaded) = (&scratch.active, scratch.loaded as u64);
+        let again = active.windows(2).filter(|pair| kept.colors == 1 && pair[0] == pair[1]).count();
+        let compared = (active.len() - again) as u64;
         let twice = if kept.colors == 2 { 1 } else { 0 };
         let (candidates, share) = (self.candidates(x, y), u64::from(interpolated));
         let cost = |features: u64, loaded: u64, compared: u64| {
