@@ -2,8 +2,8 @@
 //!
 //! One tile goes one way: `body` reads frames, which `inflate` decompresses, and `receive` decodes them as they come, after
 //! it has reserved the tile's memory; `stream` hands it to `work`, the pool of threads, and writes what comes out to
-//! `results`, a file that the client reads from, or to the canvas of one of the `images`. What a request takes beside its
-//! tiles is a `charge`, and `pace` says how slow its client may be.
+//! `results`, a file that the client reads from, or to the canvas of one of the `images`. The memory of its samples stays
+//! `spare` for the next. What a request takes beside its tiles is a `charge`, and `pace` says how slow its client may be.
 //!
 //! Threads that serve connections never wait for the disk or for the filter.
 

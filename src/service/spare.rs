@@ -128,7 +128,10 @@ mod tests {
             let budget = Budget::new(5 * MIB, 1);
             let reserve = async |mib: u64| budget.reserve(mib * MIB, Duration::from_secs(5)).await.unwrap();
             let spare = Spare::new(budget.clone());
-            let kept = || (spare.lock().planes.len(), spare.lock().bytes / MIB);
+            let kept = || {
+                let kept = spare.lock();
+                (kept.planes.len(), kept.bytes / MIB)
+            };
             let mut permit = reserve(5).await;
             spare.keep(tile(), &mut permit, MIB);
             assert_eq!((budget.free() / MIB, kept()), (4, (3, 3)));
