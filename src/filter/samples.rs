@@ -175,12 +175,29 @@ impl SampleTile {
         counts: Counts,
         planes: Vec<Plane>,
     ) -> Result<Self, SampleError> {
+        // Planes that no channel announces are refused.
+        let roles = channels.plane_channels().map(|(channel, _)| channel.role).chain(std::iter::repeat(Role::Film));
+        let cleaned = planes.into_iter().zip(roles).map(|(mut plane, role)| {
+            let replaced = if let Plane::Values(values) = &mut plane { clean(role, values) } else { 0 };
+            (plane, replaced)
+        });
+        let cleaned = cleaned.collect();
+        Self::of_clean(geometry, channels, counts, cleaned)
+    }
+
+    /// As [`new`](Self::new), of planes whose values have been through [`clean`], each with what that came to.
+    pub(crate) fn of_clean(
+        geometry: TileGeometry,
+        channels: ChannelSet,
+        counts: Counts,
+        planes: Vec<(Plane, u64)>,
+    ) -> Result<Self, SampleError> {
         let pixels = geometry.window().area();
         let total = sample_total(pixels, &counts)?;
         if planes.len() != channels.planes() {
             return Err(SampleError::Planes { got: planes.len(), expected: channels.planes() });
         }
-        for (index, plane) in planes.iter().enumerate() {
+        for (index, (plane, _)) in planes.iter().enumerate() {
             if let Plane::Values(values) = plane
                 && values.len() as u64 != total
             {
@@ -201,37 +218,29 @@ impl SampleTile {
                 SampleLayout::Varying { starts }
             }
         };
+        let (planes, replaced) = planes.into_iter().unzip();
         let mut tile = Self { geometry, channels, layout, planes, replaced: Replaced::default() };
-        tile.sanitise();
+        tile.sanitise(replaced);
         Ok(tile)
     }
 
-    fn sanitise(&mut self) {
-        let roles: Vec<Role> = self.channels.plane_channels().map(|(channel, _)| channel.role).collect();
-        for (plane, role) in self.planes.iter_mut().zip(roles) {
-            let feature = matches!(role, Role::Feature { .. });
-            let bad = |v: f32| !(v.is_finite() || v.is_nan() && feature);
-            let replaced = match plane {
+    /// Given how many values of each plane were not finite where they must be.
+    fn sanitise(&mut self, replaced: Vec<u64>) {
+        let roles = self.channels.plane_channels().map(|(channel, _)| channel.role);
+        for ((plane, role), mut replaced) in self.planes.iter_mut().zip(roles).zip(replaced) {
+            match plane {
                 Plane::Constant(value) => {
-                    let replaced = if bad(*value) { self.layout.total() } else { 0 };
-                    // -0 and 0 are equal, and which of them a tile meets first must not matter.
-                    *value = if bad(*value) { 0.0 } else { *value + 0.0 };
-                    replaced
+                    let bad = clean(role, std::slice::from_mut(value)) > 0;
+                    *value = if bad { 0.0 } else { *value };
+                    replaced = if bad { self.layout.total() as u64 } else { 0 };
                 }
-                Plane::Values(values) => {
-                    if clean(values) {
-                        continue;
+                Plane::Values(values) if replaced > 0 && role == Role::Color => {
+                    for pixel in 0..self.geometry.window().area() as usize {
+                        replace_by_mean(&mut values[self.layout.of(pixel)]);
                     }
-                    let replaced = values.iter().filter(|&&v| bad(v)).count();
-                    if replaced > 0 && role == Role::Color {
-                        for pixel in 0..self.geometry.window().area() as usize {
-                            replace_by_mean(&mut values[self.layout.of(pixel)]);
-                        }
-                    }
-                    values.iter_mut().for_each(|v| *v = if bad(*v) { 0.0 } else { *v + 0.0 });
-                    replaced
                 }
-            } as u64;
+                Plane::Values(_) => {}
+            }
             match role {
                 Role::Color => self.replaced.color += replaced,
                 Role::Feature { .. } => self.replaced.feature += replaced,
@@ -325,6 +334,11 @@ impl SampleTile {
         }
     }
 
+    /// The planes, in the order of the channels.
+    pub fn into_planes(self) -> Vec<Plane> {
+        self.planes
+    }
+
     /// What had to be made finite.
     pub const fn replaced(&self) -> Replaced {
         self.replaced
@@ -341,45 +355,66 @@ fn unite_missing(components: &mut [Plane], samples: usize) {
         }
         return;
     }
-    // Plane by plane, some samples at a time, so that the loops run in lanes.
-    const AT_ONCE: usize = 256;
+    // Plane by plane, some samples at a time, so that the loops run in lanes: masks have the width of values.
+    const AT_ONCE: usize = 512;
+    const NONE: u32 = f32::NAN.to_bits();
+    let mask = |set: bool| if set { u32::MAX } else { 0 };
     for start in (0..samples).step_by(AT_ONCE) {
-        let end = samples.min(start + AT_ONCE);
-        let (mut lacking, mut zero) = ([false; AT_ONCE], [true; AT_ONCE]);
+        let range = start..samples.min(start + AT_ONCE);
+        let (mut nan, mut not_zero) = ([0; AT_ONCE], [0; AT_ONCE]);
         for plane in &*components {
             let constant;
             let values = match plane {
                 Plane::Constant(value) => {
                     constant = [*value; AT_ONCE];
-                    &constant[..end - start]
+                    &constant[..range.len()]
                 }
-                Plane::Values(values) => &values[start..end],
+                Plane::Values(values) => &values[range.clone()],
             };
-            for ((lacking, zero), value) in lacking.iter_mut().zip(&mut zero).zip(values) {
-                *lacking |= value.is_nan();
-                *zero &= *value == 0.0;
+            for ((nan, not_zero), value) in nan.iter_mut().zip(&mut not_zero).zip(values) {
+                *nan |= mask(value.is_nan());
+                *not_zero |= mask(*value != 0.0);
             }
         }
         for plane in components.iter_mut() {
-            if let Plane::Values(values) = plane {
-                for ((value, lacking), zero) in values[start..end].iter_mut().zip(&lacking).zip(&zero) {
-                    *value = if lacking | zero { f32::NAN } else { *value };
-                }
+            let Plane::Values(values) = plane else { continue };
+            let values = &mut values[range.clone()];
+            let lacking = || nan.iter().zip(&not_zero).map(|(nan, not_zero)| nan | !not_zero);
+            let changed =
+                values.iter().zip(lacking()).fold(0, |all, (v, lacking)| all | (v.to_bits() ^ NONE) & lacking);
+            // Most often nothing is to be written.
+            if changed != 0 {
+                let united = |v: f32, lacking: u32| f32::from_bits(v.to_bits() & !lacking | NONE & lacking);
+                values.iter_mut().zip(lacking()).for_each(|(v, lacking)| *v = united(*v, lacking));
             }
         }
     }
 }
 
-/// Whether all values are finite, and none is -0: in one pass, as most are.
-fn clean(values: &[f32]) -> bool {
-    const INFINITY: u32 = f32::INFINITY.to_bits();
-    const NEGATIVE_ZERO: u32 = 1 << 31;
-    values.chunks(4096).all(|values| {
-        let odd = values.iter().map(|v| v.to_bits()).fold(0, |odd: u32, bits| {
-            odd | u32::from(bits & !NEGATIVE_ZERO >= INFINITY) | u32::from(bits == NEGATIVE_ZERO)
-        });
-        odd == 0
-    })
+/// Makes finite what must be, as far as a value alone says what it becomes, and says how many were not: all become 0 but
+/// colours, which wait for the [mean](replace_by_mean) of their pixel. -0 and 0 are equal, and which of them a tile meets
+/// first must not matter: -0 becomes 0. A plane can be cleaned in pieces, while each is at hand.
+pub(crate) fn clean(role: Role, values: &mut [f32]) -> u64 {
+    match role {
+        Role::Color => replace(values, |v| !v.is_finite(), |v| v),
+        Role::Feature { .. } => replace(values, f32::is_infinite, |_| 0.0),
+        Role::Random { .. } | Role::Film => replace(values, |v| !v.is_finite(), |_| 0.0),
+    }
+}
+
+/// Replaces bad values, and says how many there were; in one pass without branches, which runs in lanes.
+#[inline(always)]
+fn replace(values: &mut [f32], bad: impl Fn(f32) -> bool, by: impl Fn(f32) -> f32) -> u64 {
+    let piece = |values: &mut [f32]| {
+        let mut replaced = 0_u32;
+        for value in values {
+            let bad = bad(*value);
+            replaced += u32::from(bad);
+            *value = if bad { by(*value) } else { *value + 0.0 };
+        }
+        u64::from(replaced)
+    };
+    values.chunks_mut(1 << 16).map(piece).sum()
 }
 
 /// Replaces what is not finite by the mean of what is, or by 0.
@@ -388,7 +423,7 @@ fn replace_by_mean(samples: &mut [f32]) {
     let count = finite.clone().count();
     if count < samples.len() {
         let sum: f64 = finite.map(|&v| f64::from(v)).sum();
-        let mean = if count == 0 { 0.0 } else { (sum / count as f64) as f32 };
+        let mean = if count == 0 { 0.0 } else { (sum / count as f64) as f32 + 0.0 };
         samples.iter_mut().filter(|v| !v.is_finite()).for_each(|v| *v = mean);
     }
 }

@@ -25,7 +25,7 @@ use super::pace::{OpenBodies, Pace, Taken, Watched};
 /// What an HTTP/2 client sends first.
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 /// Bytes that a connection over HTTP/1.1, or a stream over HTTP/2, reads ahead; the head of a request is no longer.
-const BUFFER: u32 = 32 << 10;
+const BUFFER: u32 = 64 << 10;
 /// Most bytes of the answers of one HTTP/2 stream that wait to be sent: with [`BUFFER`] within a request's charge.
 const SEND_BUFFER: usize = 128 << 10;
 

@@ -2,8 +2,8 @@
 //!
 //! One tile goes one way: `body` reads frames, which `inflate` decompresses, and `receive` decodes them as they come, after
 //! it has reserved the tile's memory; `stream` hands it to `work`, the pool of threads, and writes what comes out to
-//! `results`, a file that the client reads from, or to the canvas of one of the `images`. What a request takes beside its
-//! tiles is a `charge`, and `pace` says how slow its client may be.
+//! `results`, a file that the client reads from, or to the canvas of one of the `images`. The memory of its samples stays
+//! `spare` for the next. What a request takes beside its tiles is a `charge`, and `pace` says how slow its client may be.
 //!
 //! Threads that serve connections never wait for the disk or for the filter.
 
@@ -27,6 +27,7 @@ mod registry;
 mod results;
 mod routes;
 mod schemas;
+mod spare;
 mod stream;
 mod trace;
 mod work;
@@ -44,7 +45,7 @@ use axum::Router;
 use tokio::{sync::watch, task::JoinSet, time::timeout};
 
 use crate::{
-    admission::Budget,
+    admission::{AdmissionError, Budget, Permit},
     config::{Config, ConfigError},
 };
 use auth::{Auth, TokensError};
@@ -53,6 +54,7 @@ use health::{Readiness, Reason};
 use metrics::{Counted, Metrics};
 use pace::Pace;
 use registry::{Images, StartError};
+use spare::Spare;
 use work::Work;
 
 /// Connections at once to the address for metrics.
@@ -116,6 +118,7 @@ struct Inner {
     config: Config,
     /// Memory for tiles.
     budget: Budget,
+    spare: Spare,
     /// Memory for requests.
     requests: Budget,
     /// Disk for results that nobody has read yet.
@@ -128,6 +131,18 @@ struct Inner {
 }
 
 impl Inner {
+    /// Reserves memory for a tile, as [`Budget::reserve_after`] does.
+    async fn reserve(
+        &self,
+        bytes: u64,
+        own: impl Future<Output = ()>,
+        deadline: Duration,
+    ) -> Result<Permit, AdmissionError> {
+        let permit = self.budget.reserve_after(bytes, own, deadline).await?;
+        self.spare.make_room();
+        Ok(permit)
+    }
+
     /// How slow a client may be.
     const fn pace(&self) -> Pace {
         Pace { idle: self.config.idle_deadline, rate: self.config.min_rate.0 }
@@ -183,7 +198,8 @@ impl Service {
             StartError::Io(source) => data_dir(source),
         })?;
         let (counts, readiness) = (Metrics::new(), Readiness::default());
-        let inner = Inner { config, budget, requests, unread, work, images, auth, metrics: counts, readiness };
+        let spare = Spare::new(budget.clone());
+        let inner = Inner { config, budget, spare, requests, unread, work, images, auth, metrics: counts, readiness };
         Ok(Self { listener, address, metrics, inner: Arc::new(inner) })
     }
 
@@ -242,11 +258,12 @@ impl Service {
     }
 }
 
-/// Sees to images that nobody uses, now and then.
+/// Sees to images, and memory, that nobody uses, now and then.
 async fn tidy(inner: Shared) {
     let mut interval = tokio::time::interval(TIDY.min(inner.config.image_ttl / 4));
     loop {
         interval.tick().await;
+        inner.spare.tidy();
         let inner = Arc::clone(&inner);
         let _ = work::blocking(move || inner.images.tidy()).await;
     }

@@ -224,16 +224,18 @@ fn fits(call: &Call, header: &Header, max_per_pixel: u32) -> Result<(Plan, u64),
 }
 
 /// Waits for the memory of a tile whose counts are known.
-async fn admit(call: &Call, assembler: Assembler, unread: Permit, max_per_pixel: u32) -> Result<Open, Fault> {
+async fn admit(call: &Call, mut assembler: Assembler, unread: Permit, max_per_pixel: u32) -> Result<Open, Fault> {
     let header = assembler.header();
     let tile = |refusal| Fault::Tile(header.geometry().core(), refusal);
     let (plan, needed) = fits(call, header, max_per_pixel).map_err(tile)?;
     // What this request's own tiles hold will be free again: that is no queue.
     let (waiting, asked) = (call.service.metrics.wait(), Instant::now());
-    let permit = call.service.budget.reserve_after(needed, call.idle(), call.service.config.queue_deadline).await;
+    let permit = call.service.reserve(needed, call.idle(), call.service.config.queue_deadline).await;
     call.service.metrics.phase(Phase::Queue, asked);
     drop(waiting);
     let permit = permit.map_err(|error| tile(error.into()))?;
+    let (planes, values) = (header.channels().planes(), header.total());
+    assembler.reuse(call.service.spare.take(planes, values));
     Ok(Open::Planes(Received { assembler, plan, permit, unread }, Instant::now()))
 }
 

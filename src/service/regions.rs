@@ -110,7 +110,7 @@ async fn drain(service: &Shared, opened: &Opened) -> Result<(), Refusal> {
                 let (service, image) = (Arc::clone(service), Arc::clone(&opened.image));
                 jobs.spawn(async move {
                     // Others finish some time: there is nobody to be told that it takes long.
-                    let permit = match service.budget.reserve(job.bytes, MAX_DEADLINE).await {
+                    let permit = match service.reserve(job.bytes, std::future::ready(()), MAX_DEADLINE).await {
                         Ok(permit) => permit,
                         Err(error) => {
                             image.give_back(&job);

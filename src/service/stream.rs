@@ -126,8 +126,7 @@ impl Call {
         };
         let filtered = filter(&tile, &self.method, &execution).map_err(|_| stopped())?;
         self.service.metrics.phase(Phase::Filter, started);
-        drop(tile);
-        held.permit.shrink_to(held.output);
+        held.free(tile, &self.service);
         let seconds = started.elapsed().as_secs_f64();
         let report = TileReport::new(&filtered.report, &self.method, self.seed, seconds);
         tracing::debug!(tile = %filtered.core, seconds, samples = report.samples, exact = report.exact, "tile filtered");
@@ -147,7 +146,7 @@ impl Call {
         }
         let geometry = *received.assembler.header().geometry();
         let Received { assembler, plan, permit, unread } = received;
-        let held = Held { permit, output: plan.output };
+        let mut held = Held { permit, output: plan.output };
         let tile = assembler.finish()?;
         match &self.target {
             Target::Client => {
@@ -160,8 +159,14 @@ impl Call {
             }
             Target::Image { image, replace } => {
                 let state = match image.offer(&tile, *replace)? {
-                    Outcome::Repeated => "repeated",
-                    Outcome::Stored => "stored",
+                    Outcome::Repeated => {
+                        held.free(tile, &self.service);
+                        "repeated"
+                    }
+                    Outcome::Stored => {
+                        held.free(tile, &self.service);
+                        "stored"
+                    }
                     Outcome::Filter(claim) => {
                         let (Done { filtered, report }, _held) = self.filter(tile, held, pool, stop)?;
                         let began = Instant::now();
@@ -222,6 +227,13 @@ impl Call {
 struct Held {
     permit: Permit,
     output: u64,
+}
+
+impl Held {
+    /// Gives up the samples, and the memory they took.
+    fn free(&mut self, tile: SampleTile, service: &Shared) {
+        service.spare.keep(tile, &mut self.permit, self.output);
+    }
 }
 
 /// Says what cannot be said to the client.

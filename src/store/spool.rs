@@ -373,11 +373,8 @@ impl Part for SpoolPart<'_> {
         let mut bytes = vec![0; into.len() * format.bytes() as usize];
         self.backing.read(offset + sample * format.bytes(), &mut bytes)?;
         let mut slots = into.iter_mut();
-        ValueReader::new(format).push(&bytes, |value| {
-            if let Some(slot) = slots.next() {
-                *slot = value;
-            }
-        });
+        ValueReader::new(format)
+            .push(&bytes, |piece| piece.iter().zip(&mut slots).for_each(|(value, slot)| *slot = *value));
         Ok(())
     }
 }

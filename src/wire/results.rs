@@ -187,7 +187,7 @@ impl Pull for ResultDecoder {
                     let ended = *left == 0;
                     if let Some((result, plane)) = &mut self.result {
                         let values = &mut result.rgb[*plane];
-                        reader.push(bytes, |value| values.push(value));
+                        reader.push(bytes, |piece| values.extend_from_slice(piece));
                         *plane += usize::from(ended);
                     }
                     if ended {

@@ -158,7 +158,7 @@ pub fn scan_file(file: &mut TileFile) -> Result<Summary, FileError> {
                             reading = Some(plane);
                         }
                         let plane = &mut summary.planes[plane];
-                        values.push(bytes, |value| plane.add(value, 1));
+                        values.push(bytes, |piece| piece.iter().for_each(|&value| plane.add(value, 1)));
                     }
                     Event::PlaneEnd { plane } => {
                         summary.spool_bytes += tile.core_samples * Format::bytes(formats[plane]);

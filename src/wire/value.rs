@@ -1,5 +1,10 @@
 //! Numbers: the two formats of planes, and how anything is rounded to them.
 
+use half::slice::HalfFloatSliceExt;
+
+/// Values that are read at once: they stay in the fastest cache while something is done with them.
+const AT_ONCE: usize = 1024;
+
 /// A number as MessagePack has it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Number {
@@ -62,6 +67,22 @@ impl Format {
             Self::F16 => out.extend_from_slice(&half::f16::from_f32(value).to_le_bytes()),
         }
     }
+
+    /// Reads as many values, at most [`AT_ONCE`], as there are bytes for.
+    fn read(self, bytes: &[u8], values: &mut [f32]) {
+        match self {
+            Self::F32 => {
+                let (bytes, _) = bytes.as_chunks();
+                values.iter_mut().zip(bytes).for_each(|(value, &bytes)| *value = f32::from_le_bytes(bytes));
+            }
+            Self::F16 => {
+                let (bytes, _) = bytes.as_chunks();
+                let mut halves = [half::f16::ZERO; AT_ONCE];
+                halves.iter_mut().zip(bytes).for_each(|(half, &bytes)| *half = half::f16::from_le_bytes(bytes));
+                halves[..values.len()].convert_to_f32_slice(values);
+            }
+        }
+    }
 }
 
 /// Rounds to `f32` such that rounding the result again, to f16, is as good as rounding `value` once: what is lost shows
@@ -89,8 +110,9 @@ impl ValueReader {
         Self { format, carry: [0; 4], carried: 0 }
     }
 
-    /// Calls `sink` with every value that is whole; the bytes of one that is not are kept for the next call.
-    pub fn push(&mut self, mut bytes: &[u8], mut sink: impl FnMut(f32)) {
+    /// Calls `sink` with all values that are whole, some at a time; the bytes of one that is not are kept for the next
+    /// call.
+    pub fn push(&mut self, mut bytes: &[u8], mut sink: impl FnMut(&mut [f32])) {
         let size = self.format.bytes() as usize;
         if self.carried > 0 {
             let taken = (size - self.carried).min(bytes.len());
@@ -101,24 +123,17 @@ impl ValueReader {
                 return;
             }
             self.carried = 0;
-            let [a, b, c, d] = self.carry;
-            sink(match self.format {
-                Format::F32 => f32::from_le_bytes([a, b, c, d]),
-                Format::F16 => half::f16::from_le_bytes([a, b]).to_f32(),
-            });
+            let mut value = [0.0];
+            self.format.read(&self.carry[..size], &mut value);
+            sink(&mut value);
         }
-        let rest = match self.format {
-            Format::F32 => {
-                let (values, rest) = bytes.as_chunks::<4>();
-                values.iter().for_each(|&v| sink(f32::from_le_bytes(v)));
-                rest
-            }
-            Format::F16 => {
-                let (values, rest) = bytes.as_chunks::<2>();
-                values.iter().for_each(|&v| sink(half::f16::from_le_bytes(v).to_f32()));
-                rest
-            }
-        };
+        let (whole, rest) = bytes.split_at(bytes.len() / size * size);
+        let mut values = [0.0; AT_ONCE];
+        for bytes in whole.chunks(AT_ONCE * size) {
+            let values = &mut values[..bytes.len() / size];
+            self.format.read(bytes, values);
+            sink(values);
+        }
         self.carry[..rest.len()].copy_from_slice(rest);
         self.carried = rest.len();
     }
@@ -180,7 +195,7 @@ mod tests {
             values.iter().for_each(|&v| format.write(v, &mut bytes));
             let read = |piece: usize| {
                 let (mut reader, mut out) = (ValueReader::new(format), Vec::new());
-                bytes.chunks(piece).for_each(|chunk| reader.push(chunk, |v| out.push(v)));
+                bytes.chunks(piece).for_each(|chunk| reader.push(chunk, |v| out.extend_from_slice(v)));
                 out
             };
             for piece in 1..=bytes.len() {

@@ -105,10 +105,10 @@ fn little_time_is_spent_outside_of_the_filter() {
     let server = Server::start(&["--threads", "2"]);
     let process = Process::of(server.pid());
     let tile = encode(&samples([512, 512], Rect::new(128, 128, 256, 256), 17, 1));
-    for _ in 0..if full() { 8 } else { 1 } {
+    for _ in 0..if full() { 16 } else { 4 } {
         assert_eq!(server.post("/v1/filter?preset=lean", &tile).messages().len(), 2);
     }
-    // Taking the samples in, and making them finite, counts as outside. A tenth is the aim; an eighth was measured.
+    // Taking the samples in, and making them finite, counts as outside.
     let (all, filter) = (process.cpu_seconds(), process.filter_seconds());
     let outside = (all - filter) / all;
     println!(
@@ -116,7 +116,7 @@ fn little_time_is_spent_outside_of_the_filter() {
         tile.len() / 1_000_000,
         100.0 * outside
     );
-    assert!(all - filter <= all / 5.0, "{filter} of {all} seconds are the filter's");
+    assert!(all - filter <= all / 10.0, "{filter} of {all} seconds are the filter's");
 }
 
 /// Waits a little: what others hold will be free soon.

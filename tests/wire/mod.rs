@@ -127,7 +127,7 @@ pub(crate) fn read_raw(bytes: &[u8], mut piece: impl FnMut() -> usize) -> Result
                     assert_eq!(plane, tile.planes.len());
                     let (reader, list) =
                         values.get_or_insert_with(|| (ValueReader::new(header.plane_format(plane)), Vec::new()));
-                    reader.push(bytes, |value| list.push(value));
+                    reader.push(bytes, |piece| list.extend_from_slice(piece));
                 }
                 Event::PlaneEnd { plane } => {
                     assert_eq!(plane, tile.planes.len());
