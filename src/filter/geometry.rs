@@ -45,9 +45,10 @@ impl Rect {
         x >= self.x && x < self.right() && y >= self.y && y < self.bottom()
     }
 
-    /// Whether all of `other` lies inside.
+    /// Whether all of `other`, which may be of any numbers, lies inside.
     pub const fn covers(&self, other: &Rect) -> bool {
-        other.x >= self.x && other.right() <= self.right() && other.y >= self.y && other.bottom() <= self.bottom()
+        let wide = other.x >= self.x && other.x <= self.right() && other.width <= self.right() - other.x;
+        wide && other.y >= self.y && other.y <= self.bottom() && other.height <= self.bottom() - other.y
     }
 
     /// The common part of the two, if they overlap.
@@ -55,6 +56,20 @@ impl Rect {
         let (x, y) = (self.x.max(other.x), self.y.max(other.y));
         let (right, bottom) = (self.right().min(other.right()), self.bottom().min(other.bottom()));
         (x < right && y < bottom).then(|| Rect::new(x, y, right - x, bottom - y))
+    }
+
+    /// The parts of it that lie outside of another one, which do not overlap: four at most.
+    pub fn without(&self, hole: &Rect) -> impl Iterator<Item = Rect> + use<> {
+        // What lies apart from it takes nothing away.
+        let hole = self.intersection(hole).unwrap_or(Rect::new(self.x, self.y, 0, 0));
+        let Rect { x, y, width, height } = *self;
+        let parts = [
+            Rect::new(x, y, width, hole.y - y),
+            Rect::new(x, hole.y, hole.x - x, hole.height),
+            Rect::new(hole.right(), hole.y, self.right() - hole.right(), hole.height),
+            Rect::new(x, hole.bottom(), width, y + height - hole.bottom()),
+        ];
+        parts.into_iter().filter(|part| part.area() > 0)
     }
 
     /// Grown by `by` pixels on every side, as far as `bounds` allow.
@@ -229,6 +244,30 @@ mod tests {
         let geometry = TileGeometry::new([100, 50], Rect::new(10, 20, 30, 15), halo).unwrap();
         assert_eq!(geometry.window(), Rect::new(7, 18, 37, 18));
         assert_eq!(geometry.halo_for(12), Halo { left: 10, top: 12, right: 12, bottom: 12 });
+    }
+
+    #[test]
+    fn without_a_hole_the_rest_is_left() {
+        let rect = Rect::new(3, 2, 4, 5);
+        for (x, y) in (0..9).flat_map(|x| (0..9).map(move |y| (x, y))) {
+            for (width, height) in [(1, 1), (4, 5), (9, 2), (2, 9), (9, 9)] {
+                let hole = Rect::new(x, y, width, height);
+                assert_eq!(rect.covers(&hole), hole.without(&rect).count() == 0);
+                let parts: Vec<Rect> = rect.without(&hole).collect();
+                assert!(parts.len() <= 4 && parts.iter().all(|part| part.area() > 0));
+                for (x, y) in (0..9).flat_map(|x| (0..9).map(move |y| (x, y))) {
+                    let times = parts.iter().filter(|part| part.contains(x, y)).count();
+                    assert_eq!(times, usize::from(rect.contains(x, y) && !hole.contains(x, y)), "{hole}: {x}, {y}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn numbers_that_wrap_around_are_not_inside() {
+        let image = Rect::new(0, 0, 40, 30);
+        assert!(image.covers(&image) && image.covers(&Rect::new(40, 30, 0, 0)));
+        assert!(!image.covers(&Rect::new(30, 0, u32::MAX - 20, 1)) && !image.covers(&Rect::new(0, u32::MAX, 1, 2)));
     }
 
     #[test]

@@ -4,8 +4,8 @@ use serde_json::{Map, Value, json};
 
 use super::{MAX_TILES, MIN_CORE};
 use crate::{
-    filter::{Channel, ChannelSet, Method, Role, geometry::MAX_SIDE},
-    store::{samples, state},
+    filter::{Channel, ChannelSet, Method, Role, geometry::MAX_SIDE, samples::MAX_SAMPLES_PER_PIXEL},
+    store::state,
 };
 
 /// What an image is to be.
@@ -72,19 +72,24 @@ impl Description {
             let side = u32::try_from(value["size"][i].as_u64()?).ok()?;
             (1..=MAX_SIDE).contains(&side).then_some(side)
         };
+        let size = [side(0)?, side(1)?];
+        // So many parts of the image are kept track of.
+        let regions = |region: u32| size.map(|side| u64::from(side.div_ceil(region))).into_iter().product::<u64>();
         let parameters = value["parameters"].as_object()?.iter();
         let parameters = parameters.map(|(name, value)| Some((name, value.as_str()?))).collect::<Option<Vec<_>>>()?;
         let neighbors = match &value["neighbors"] {
             Value::Null => None,
             known => Some(Announced {
                 channels: channels_from_json(&known["channels"]).ok()?,
-                samples: u32::try_from(known["samples"].as_u64()?).ok()?,
+                samples: u32::try_from(known["samples"].as_u64()?).ok().filter(|&n| n <= MAX_SAMPLES_PER_PIXEL)?,
                 varying: known["varying"].as_bool()?,
-                region: u32::try_from(known["region"].as_u64()?).ok().filter(|&side| side > 0)?,
+                region: u32::try_from(known["region"].as_u64()?)
+                    .ok()
+                    .filter(|&side| side > 0 && regions(side) <= MAX_TILES as u64)?,
             }),
         };
         Some(Self {
-            size: [side(0)?, side(1)?],
+            size,
             method: Method::with(value["preset"].as_str()?, parameters).ok()?,
             seed: value["seed"].as_u64()?,
             leave_out: value["leave_out"].as_bool()?,
@@ -98,6 +103,33 @@ impl Description {
 pub fn disk_bytes(description: &Description) -> u64 {
     let [width, height] = description.size.map(u64::from);
     let pixels = width * height;
+    let samples = description.neighbors.as_ref().map_or(0, |known| {
+        let cores = most_cores(description.size);
+        known.room(cores, pixels) + known.room(cores.div_ceil(4), lendable(pixels))
+    });
+    beside_samples(description).saturating_add(samples)
+}
+
+/// Of these bytes, those that are for samples.
+pub(super) fn sample_bytes(description: &Description) -> u64 {
+    description.disk.saturating_sub(beside_samples(description))
+}
+
+/// Pixels for which there is always room when halos bring them ahead of their cores: of a small image all, of a large one
+/// a quarter. Room that cores do not need, since samples compress or are dropped, comes on top.
+fn lendable(pixels: u64) -> u64 {
+    pixels.min(pixels / 4 + (1 << 16))
+}
+
+/// Cores that an image may have, and parts of halos that are kept of it.
+pub(super) fn most_cores(size: [u32; 2]) -> u64 {
+    let [columns, rows] = size.map(|side| u64::from(side / MIN_CORE) + 2);
+    (columns * rows).min(MAX_TILES as u64)
+}
+
+fn beside_samples(description: &Description) -> u64 {
+    let [width, height] = description.size.map(u64::from);
+    let pixels = width * height;
     let (base, record) = state::STATE_BYTES;
     let most = |tiles: u64| tiles.min(MAX_TILES as u64);
     // An EXR does not compress at worst, and has a table and attributes.
@@ -105,13 +137,10 @@ pub fn disk_bytes(description: &Description) -> u64 {
     match &description.neighbors {
         None => pixels * 24 + result + base + most(pixels) * record,
         Some(known) => {
-            let least = u64::from(MIN_CORE);
-            let cores = most((width / least + 2) * (height / least + 2));
             let region = u64::from(known.region);
             let regions = most(width.div_ceil(region) * height.div_ceil(region));
-            let samples = pixels * u64::from(known.samples);
-            let samples = samples::worst_case(cores, pixels, samples, known.channels.planes(), known.varying);
-            pixels * 12 + result + base + (cores + 4 * regions) * record + samples
+            // Of cores and halos one each; of the parts of a region the tile, and whether it is final.
+            pixels * 12 + result + base + (2 * most_cores(description.size) + 8 * regions) * record
         }
     }
 }
@@ -209,9 +238,14 @@ mod tests {
         let with = Description { neighbors: Some(known.clone()), ..bare.clone() };
         assert_eq!(Description::decode(&with.encode()), Some(with.clone()));
         assert!(!bare.same(&with));
-        let other = Description { neighbors: Some(Announced { region: 32, ..known }), disk: 8, ..with.clone() };
+        let other = Description { neighbors: Some(Announced { region: 32, ..known.clone() }), disk: 8, ..with.clone() };
         assert!(with.same(&other) && with != other);
         assert_eq!(Description::decode(b"{}"), None);
+        let many = |size, region| {
+            let known = Announced { region, ..known.clone() };
+            Description::decode(&Description { size, neighbors: Some(known), ..bare.clone() }.encode())
+        };
+        assert!(many([MAX_TILES as u32, 2], 2).is_some() && many([MAX_TILES as u32, 2], 1).is_none());
     }
 
     #[test]

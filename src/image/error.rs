@@ -48,9 +48,11 @@ pub enum ImageError {
         announced: String,
     },
     /// A region that cannot be filtered within the memory there is.
-    #[error("a single pixel of tile {core} needs {needed} bytes of memory with its halo, and {most} is all there is")]
+    #[error(
+        "tile {core} cannot be made smaller, needs {needed} bytes of memory with its halo, and {most} is all there is"
+    )]
     TooLarge {
-        /// The pixel.
+        /// A single pixel, or a tile that is to be filtered again.
         core: Rect,
         /// Bytes needed.
         needed: u64,

@@ -5,11 +5,11 @@ use crate::{
     disk::Folder,
     filter::{ChannelSet, Filtered, Rect, samples::Replaced},
     stitch::{Digest, Offer, Stitcher, canvas::Checksum},
-    store::Change,
+    store::{Change, Records},
 };
 
 impl Inner {
-    pub(super) fn queue(&mut self, changes: impl IntoIterator<Item = Change>, after: Option<After>) {
+    pub(super) fn queue(&mut self, changes: impl IntoIterator<Item = Change>, after: impl IntoIterator<Item = After>) {
         self.changes.extend(changes);
         self.after.extend(after);
         self.queued += 1;
@@ -30,14 +30,16 @@ impl Inner {
 
     pub(super) fn record(&self, digest: Digest, checksum: Checksum, filtered: &Filtered, seconds: f64) -> Change {
         let record = TileRecord { digest, checksum, seconds, report: filtered.report.clone() };
-        Change::Tile(filtered.core, self.channels.as_ref().map_or_else(Vec::new, |channels| record.encode(channels)))
+        let record = self.channels.as_ref().map_or_else(Vec::new, |channels| record.encode(channels));
+        Change::Put(Records::Tiles, filtered.core, record)
     }
 
     pub(super) fn committed(&mut self, after: After) {
         let Some(neighbors) = &mut self.neighbors else { return };
         match after {
             After::Arrived(core) => neighbors.arrived(&core),
-            After::RegionDone(region) => neighbors.done(region),
+            After::Lent(part) => neighbors.lent(&part),
+            After::Filtered(region, last) => neighbors.filtered(region, last),
             After::Finished => neighbors.finish(),
         }
     }
@@ -68,10 +70,18 @@ impl Inner {
         self.finished
     }
 
+    /// Whether every pixel is filtered for good.
+    pub fn complete(&self) -> bool {
+        self.stitcher.is_complete() && self.open_regions() == 0
+    }
+
     /// Whether nothing more will come, and all that can be filtered is.
     pub fn settled(&self) -> bool {
-        let waiting = self.neighbors.as_ref().map_or(0, |neighbors| neighbors.regions().open());
-        self.stitcher.is_complete() || self.finished && waiting == 0
+        (self.stitcher.is_complete() || self.finished) && self.open_regions() == 0
+    }
+
+    fn open_regions(&self) -> usize {
+        self.neighbors.as_ref().map_or(0, |neighbors| neighbors.regions().open())
     }
 
     /// How often a tile took the place of another since it was opened.
@@ -97,6 +107,11 @@ impl Inner {
     /// The parts of a window that no bare core has brought.
     pub fn absent(&self, window: &Rect) -> Vec<Rect> {
         self.neighbors.as_ref().map_or_else(Vec::new, |neighbors| neighbors.absent(window))
+    }
+
+    /// What a region waits for: pixels that have not come, or, if it is filtered, not in cores.
+    pub fn awaited(&self, region: u32) -> Vec<Rect> {
+        self.neighbors.as_ref().map_or_else(Vec::new, |neighbors| neighbors.awaited(region))
     }
 
     /// Values that were replaced in bare cores. The regions' own reports know nothing of them.

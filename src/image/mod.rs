@@ -10,16 +10,19 @@
 //!
 //! Pixels are never written over in place: a tile that replaces another is written beside the canvas first.
 
+mod announced;
 pub mod description;
 mod error;
 mod inner;
+mod jobs;
 mod neighbors;
 mod record;
 pub mod regions;
 
+pub use announced::keeping;
 pub use description::{Announced, Description, disk_bytes};
 pub use error::ImageError;
-pub use neighbors::{Job, keeping};
+pub use jobs::Job;
 pub use regions::{RegionState, Regions};
 
 use std::{
@@ -40,7 +43,7 @@ use crate::{
         Added, Canvas, CanvasError, Claim, ExrOptions, Offer, Pixels, StitchError, Stitcher, Verdict, canvas::Checksum,
         digest::digest,
     },
-    store::{Change, State, StateError, samples, state},
+    store::{Change, Records, State, StateError, samples, state},
 };
 use description::{channels_from_json, channels_to_json};
 use neighbors::Neighbors;
@@ -139,7 +142,9 @@ pub struct Inner {
 #[derive(Clone, Copy, Debug)]
 enum After {
     Arrived(Rect),
-    RegionDone(u32),
+    Lent(Rect),
+    /// A region, and whether for good.
+    Filtered(u32, bool),
     Finished,
 }
 
@@ -183,7 +188,7 @@ impl Image {
         };
         let (mut stitcher, mut notes) = (Stitcher::on(canvas.clone()), HashMap::new());
         let mut wrong = None;
-        state.tiles(|core, bytes| {
+        state.each(Records::Tiles, |core, bytes| {
             let record = channels.as_ref().and_then(|channels| TileRecord::decode(bytes, channels));
             let Some(TileRecord { digest, checksum, seconds, report }) = record else {
                 wrong.get_or_insert(format!("the record of tile {core} cannot be read"));
@@ -383,14 +388,18 @@ impl Image {
         let (changes, after, queued, samples) = {
             let mut inner = self.write();
             let samples = inner.neighbors.as_ref().map(Neighbors::file);
-            (std::mem::take(&mut inner.changes), std::mem::take(&mut inner.after), inner.queued, samples)
+            let mut changes = std::mem::take(&mut inner.changes);
+            changes.extend(inner.neighbors.iter_mut().flat_map(Neighbors::forget));
+            (changes, std::mem::take(&mut inner.after), inner.queued, samples)
+        };
+        let any = |wanted: &[Records]| {
+            changes.iter().any(|change| matches!(change, Change::Put(records, ..) if wanted.contains(records)))
         };
         let sync = || {
-            if changes.iter().any(|change| matches!(change, Change::Tile(..))) {
+            if any(&[Records::Tiles]) {
                 self.canvas.sync()?;
             }
-            if let (Some(samples), true) = (samples, changes.iter().any(|change| matches!(change, Change::Samples(..))))
-            {
+            if let (Some(samples), true) = (samples, any(&[Records::Samples, Records::Lent])) {
                 samples.sync()?;
             }
             Ok::<_, io::Error>(())

@@ -1,139 +1,103 @@
-//! Images whose tiles come as bare cores: the samples are kept until all regions that read them are filtered.
+//! Images whose tiles lend each other their halos: the samples are kept until all regions that read them are filtered.
+//!
+//! Of a pixel its core has the last word. Until that has come, what a halo brings stands for it, so that regions need not
+//! wait; such pixels are kept once, as far as there is [room](sample_bytes) beside all cores that may still come. What was
+//! filtered from them is *provisional*: when the cores have come their samples are compared with what was read then, and
+//! only if they differ it is filtered again.
 
-use std::{
-    sync::{Arc, atomic::Ordering},
-    time::Instant,
-};
-
-use rayon::ThreadPool;
+use std::{collections::BTreeMap, sync::Arc};
 
 use super::{
-    After, Announced, Claimed, Description, Image, ImageError, MAX_TILES, MIN_CORE, Outcome, Regions,
-    record::CoreRecord,
+    After, Announced, Description, Image, ImageError, MAX_TILES, Outcome, RegionState, Regions,
+    announced::small,
+    description::{most_cores, sample_bytes},
+    jobs::unfiltered,
+    record::{CoreRecord, extent_from_bytes, extent_to_bytes},
 };
 use crate::{
     disk::Folder,
-    filter::{
-        Coverage, Execution, Method, Rect, SampleTile, TileGeometry, filter,
-        plan::{Plan, Shape, plan},
-        samples::Replaced,
-    },
-    stitch::{Digest, Offer, StitchError, Stitcher},
-    store::{Change, Extent, SampleFile, State, samples::BUFFERS},
-    wire::{Header, SampleCounts},
+    filter::{Coverage, Rect, SampleTile, TileGeometry, samples::Replaced},
+    stitch::{Digest, StitchError, Stitcher},
+    store::{Change, Extent, Records, SampleFile, Source, State},
 };
-
-/// Sides of regions, in pixels. Larger ones have less halo to compute twice.
-const SIDES: [u32; 10] = [512, 384, 320, 256, 192, 128, 96, 64, 32, 16];
-/// Of an image this many regions, at least, make it come out in parts while it comes in.
-const PARTS: u64 = 16;
-/// No region is smaller for that.
-const LEAST: u32 = 64;
 
 /// What is kept of bare cores.
 #[derive(Debug)]
 pub(super) struct Neighbors {
     file: Arc<SampleFile>,
     cores: Coverage<Core>,
+    /// Pixels that a halo brought before their core came.
+    lent: Coverage<Lent>,
+    /// By region, the tiles on the canvas that are provisional.
+    provisional: BTreeMap<u32, Vec<Rect>>,
+    /// Records of what was lent that are of no use any more.
+    forgotten: Vec<Rect>,
+    room: Room,
     pixels: u64,
     replaced: Replaced,
     regions: Regions,
     /// Regions that are being filtered.
-    running: usize,
+    pub(super) running: usize,
 }
 
 #[derive(Debug)]
 struct Core {
     digest: Digest,
     extent: Extent,
+    /// Whether the regions know of it.
+    counted: bool,
     /// Whether its samples are not needed any more.
     dropped: bool,
 }
 
-/// A region that can be filtered.
 #[derive(Debug)]
-pub struct Job {
-    region: u32,
-    /// What of it is to be filtered, and the samples for it.
-    tiles: Vec<(TileGeometry, Vec<(Rect, Extent)>)>,
-    /// Bytes of memory that this needs at most.
-    pub bytes: u64,
+struct Lent {
+    /// None while it is being written.
+    extent: Option<Extent>,
+    counted: bool,
 }
 
-impl Announced {
-    /// Chooses the side of the regions so that filtering one takes at most so many bytes on so many threads; if that is
-    /// not possible, says what the smallest would take.
-    pub fn choose_region(
-        &mut self,
-        size: [u32; 2],
-        method: &Method,
-        threads: usize,
-        bytes: u64,
-        most: u64,
-    ) -> Result<(), u64> {
-        let pixels = u64::from(size[0]) * u64::from(size[1]);
-        let area = |side: u32| u64::from(side) * u64::from(side);
-        let count = |side: u32| u64::from(size[0].div_ceil(side)) * u64::from(size[1].div_ceil(side));
-        let cost = |side: u32| {
-            let core = Rect::new(size[0].saturating_sub(side) / 2, size[1].saturating_sub(side) / 2, side, side);
-            let core = core.intersection(&Rect::new(0, 0, size[0], size[1])).unwrap_or(core);
-            let reach = method.reach(self.varying);
-            TileGeometry::with_halo(size, core, reach).map_or(u64::MAX, |geometry| {
-                let window = geometry.window();
-                let cores = u64::from(window.width / MIN_CORE + 2) * u64::from(window.height / MIN_CORE + 2);
-                let finding = BUFFERS + cores * (512 + 128 * self.channels.planes() as u64);
-                self.cost(&geometry, method, threads, self.varying) + finding
-            })
-        };
-        let sides = || SIDES.into_iter().filter(|&side| count(side) <= MAX_TILES as u64);
-        let parts = |side: &u32| *side <= LEAST || pixels / area(*side) >= PARTS;
-        let found = sides().filter(parts).find(|&side| cost(side) <= bytes);
-        match found.or_else(|| sides().find(|&side| cost(side) <= most)) {
-            Some(side) => {
-                self.region = side;
-                Ok(())
-            }
-            None => Err(sides().map(cost).min().unwrap_or(u64::MAX)),
+/// Disk for samples.
+#[derive(Debug)]
+struct Room {
+    /// Bytes that were set aside.
+    all: u64,
+    /// Bytes that are taken.
+    taken: u64,
+    announced: Announced,
+    /// Cores that may come in all, and pixels.
+    cores: u64,
+    pixels: u64,
+}
+
+impl Room {
+    fn new(description: &Description, announced: &Announced) -> Self {
+        let [width, height] = description.size.map(u64::from);
+        Self {
+            all: sample_bytes(description),
+            taken: 0,
+            announced: announced.clone(),
+            cores: most_cores(description.size),
+            pixels: width * height,
         }
     }
 
-    /// Bytes of memory that filtering such a tile takes at most, but for finding its samples.
-    fn cost(&self, geometry: &TileGeometry, method: &Method, threads: usize, varying: bool) -> u64 {
-        let samples = geometry.window().area() * u64::from(self.samples);
-        let shape = Shape { geometry, channels: &self.channels, samples, max_per_pixel: self.samples, varying };
-        plan(&shape, method).total(threads)
+    /// Takes room for some pixels that a halo brings, if there is any beside what is owed to the cores that are still to
+    /// come, after so many with so many pixels.
+    fn lend(&mut self, part: &Rect, cores: usize, pixels: u64) -> bool {
+        let owed = self.announced.room(self.cores.saturating_sub(cores as u64), self.pixels.saturating_sub(pixels));
+        let wanted = self.announced.room(1, part.area());
+        let fits =
+            self.taken.checked_add(wanted).and_then(|sum| sum.checked_add(owed)).is_some_and(|sum| sum <= self.all);
+        self.taken += if fits { wanted } else { 0 };
+        fits
     }
 
-    /// Refuses samples that were not announced; of varying ones only the header is known.
-    pub fn check(&self, header: &Header) -> Result<(), ImageError> {
-        let core = header.geometry().core();
-        small(&core, &header.geometry().image())?;
-        match header.samples() {
-            SampleCounts::Uniform(n) if n == self.samples || self.varying && n < self.samples => Ok(()),
-            SampleCounts::Varying { .. } if self.varying => Ok(()),
-            SampleCounts::Uniform(n) => Err(self.mismatch(core, n.to_string())),
-            SampleCounts::Varying { .. } => Err(self.mismatch(core, "varying".to_owned())),
-        }
+    /// Gives back what was taken for pixels that are not kept, or takes less, now that it is known.
+    fn settle(&mut self, part: &Rect, extent: Option<&Extent>) {
+        self.taken -= self.announced.room(1, part.area());
+        self.taken += extent.map_or(0, Extent::room);
     }
-
-    fn mismatch(&self, core: Rect, got: String) -> ImageError {
-        let most = if self.varying { "at most " } else { "" };
-        ImageError::SampleCount { core, got, announced: format!("{most}{}", self.samples) }
-    }
-}
-
-/// Bytes that keeping the samples of a tile of this shape takes at most.
-pub fn keeping(shape: &Shape) -> Plan {
-    let samples = plan(shape, &Method::default()).samples;
-    // Beside what they are compressed in, what they are hashed in.
-    Plan { samples, working: BUFFERS + (1 << 17), ..Plan::default() }
-}
-
-/// Refuses cores that are too small.
-fn small(core: &Rect, image: &Rect) -> Result<(), ImageError> {
-    let wide = core.width >= MIN_CORE || core.x == 0 || core.right() == image.width;
-    let high = core.height >= MIN_CORE || core.y == 0 || core.bottom() == image.height;
-    if wide && high { Ok(()) } else { Err(ImageError::TooSmall(*core)) }
 }
 
 impl Neighbors {
@@ -148,17 +112,35 @@ impl Neighbors {
         let image = stitcher.image();
         let reach = description.method.reach(known.varying);
         let mut regions = Regions::new(description.size, known.region, reach);
-        let (mut cores, mut pixels, mut replaced) = (Coverage::default(), 0, Replaced::default());
+        let (mut cores, mut lent, mut provisional) = (Coverage::default(), Coverage::default(), BTreeMap::new());
+        let (mut pixels, mut replaced) = (0, Replaced::default());
         let mut wrong = None;
-        state.samples(|core, bytes| match CoreRecord::decode(bytes).filter(|_| image.covers(&core)) {
-            Some(record) if cores.meeting(&core).is_empty() => {
-                let kept = Core { digest: record.digest, extent: record.extent, dropped: false };
-                let _ = cores.insert(core, kept);
-                regions.arrived(&core);
-                pixels += core.area();
-                sum(&mut replaced, &record.replaced);
+        let mut damage = |what: &str, rect: Rect| {
+            wrong.get_or_insert(format!("the record of the samples of {what} {rect} cannot be read"));
+        };
+        state.each(Records::Samples, |core, bytes| {
+            match CoreRecord::decode(bytes).filter(|_| image.covers(&core)) {
+                Some(CoreRecord { digest, extent, replaced: more }) if cores.meeting(&core).is_empty() => {
+                    let _ = cores.insert(core, Core { digest, extent, counted: true, dropped: false });
+                    regions.arrived(&core, &[]);
+                    pixels += core.area();
+                    sum(&mut replaced, &more);
+                }
+                _ => damage("tile", core),
             }
-            _ => drop(wrong.get_or_insert(format!("the record of the samples of tile {core} cannot be read"))),
+        })?;
+        state.each(Records::Lent, |part, bytes| match extent_from_bytes(bytes).filter(|_| image.covers(&part)) {
+            Some(extent) if lent.meeting(&part).is_empty() => {
+                let _ = lent.insert(part, Lent { extent: Some(extent), counted: true });
+                cores.missing(&part).iter().for_each(|part| regions.lent(part));
+            }
+            _ => damage("a halo,", part),
+        })?;
+        // Some may not have been filtered.
+        state.each(Records::Provisional, |tile, _| {
+            if image.covers(&tile) {
+                provisional.entry(regions.at(tile.x, tile.y)).or_insert_with(Vec::new).push(tile);
+            }
         })?;
         if let Some(why) = wrong {
             return Err(state.damaged(why).into());
@@ -166,26 +148,33 @@ impl Neighbors {
         if finished {
             regions.finish();
         }
+        let file = Arc::new(SampleFile::open(folder, known.channels.clone())?);
+        let room = Room::new(description, known);
+        let forgotten = Vec::new();
+        let mut this = Self { file, cores, lent, provisional, forgotten, room, pixels, replaced, regions, running: 0 };
         // All that is ready is looked at once.
-        let ready: Vec<u32> = std::iter::from_fn(|| regions.start_next()).collect();
+        let ready: Vec<u32> = std::iter::from_fn(|| this.regions.start_next()).collect();
         for region in ready {
-            if unfiltered(&cores, stitcher, &regions.core(region)).is_empty() {
-                regions.done(region);
+            if !unfiltered(&this, stitcher, region).is_empty() {
+                this.regions.give_back(region);
+            } else if this.regions.last(region) && !this.provisional.contains_key(&region) {
+                this.regions.done(region);
             } else {
-                regions.give_back(region);
+                this.regions.filtered(region);
             }
         }
-        let all: Vec<Rect> = cores.iter().map(|(core, _)| core).collect();
-        let mut extents = Vec::new();
-        for core in all {
-            let needed = regions.need(&core);
-            if let Some(kept) = cores.get_mut(&core) {
-                kept.dropped = !needed;
-                extents.extend(needed.then_some(kept.extent));
-            }
-        }
-        let file = Arc::new(SampleFile::open(folder, known.channels.clone(), extents)?);
-        Ok(Self { file, cores, pixels, replaced, regions, running: 0 })
+        this.drop_cores(&image);
+        let lent: Vec<Rect> = this.lent.iter().map(|(part, _)| part).collect();
+        this.drop_lent(lent);
+        this.room.taken = this.extents().map(|extent| extent.room()).sum();
+        this.file.keep(this.extents().collect())?;
+        Ok(this)
+    }
+
+    /// Where the samples are that are needed.
+    fn extents(&self) -> impl Iterator<Item = Extent> {
+        let cores = self.cores.iter().filter(|(_, core)| !core.dropped).map(|(_, core)| core.extent);
+        cores.chain(self.lent.iter().filter_map(|(_, lent)| lent.extent))
     }
 
     pub(super) fn file(&self) -> Arc<SampleFile> {
@@ -204,6 +193,45 @@ impl Neighbors {
         self.cores.missing(window)
     }
 
+    /// The parts of a rectangle that cores have brought.
+    pub(super) fn present(&self, rect: &Rect) -> Vec<Rect> {
+        let mut absent: Coverage<()> = Coverage::default();
+        for gap in self.cores.missing(rect) {
+            // The gaps are apart from each other.
+            let _ = absent.insert(gap, ());
+        }
+        absent.missing(rect)
+    }
+
+    /// What a region waits for: pixels that have not come, or, if it is filtered, not in cores.
+    pub(super) fn awaited(&self, region: u32) -> Vec<Rect> {
+        let (core, window) = (self.regions.core(region), self.regions.window(region));
+        let mut there: Coverage<()> = Coverage::default();
+        if self.regions.state(region) == RegionState::Waiting {
+            let lent = self.lent.meeting(&window).into_iter().filter(|(_, lent)| lent.counted);
+            let around = lent.flat_map(|(part, _)| part.without(&core)).filter_map(|part| part.intersection(&window));
+            for part in around.flat_map(|part| self.cores.missing(&part)) {
+                let _ = there.insert(part, ());
+            }
+        }
+        for (core, _) in self.cores.meeting(&window) {
+            let _ = there.insert(core, ());
+        }
+        there.missing(&window)
+    }
+
+    /// The samples for a window: the cores', and where there are none, lent ones.
+    pub(super) fn sources(&self, window: &Rect) -> Vec<Source> {
+        let cores = self.cores.meeting(window).into_iter();
+        let cores = cores.map(|(core, kept)| Source { stored: core, extent: kept.extent, used: core });
+        let lent = self.lent.meeting(window).into_iter();
+        let lent = lent.filter_map(|(part, lent)| Some((part, lent.extent?, part.intersection(window)?)));
+        let lent = lent.flat_map(|(stored, extent, here)| {
+            self.cores.missing(&here).into_iter().map(move |used| Source { stored, extent, used })
+        });
+        cores.chain(lent).collect()
+    }
+
     pub(super) const fn replaced(&self) -> Replaced {
         self.replaced
     }
@@ -212,8 +240,58 @@ impl Neighbors {
         self.running == 0
     }
 
+    /// The records that are of no use any more; they need not be known of again.
+    pub(super) fn forget(&mut self) -> impl Iterator<Item = Change> {
+        std::mem::take(&mut self.forgotten).into_iter().map(|part| Change::Remove(Records::Lent, part))
+    }
+
+    /// The first region that is ready; it is running from now on.
+    pub(super) fn start_next(&mut self) -> Option<u32> {
+        self.regions.start_next()
+    }
+
+    pub(super) fn give_back(&mut self, region: u32) {
+        self.regions.give_back(region);
+    }
+
+    /// A tile of a region that is provisional.
+    pub(super) fn doubt(&mut self, region: u32, tile: Rect) {
+        let tiles = self.provisional.entry(region).or_default();
+        if !tiles.contains(&tile) {
+            tiles.push(tile);
+        }
+    }
+
+    pub(super) fn provisional(&self, region: u32) -> impl Iterator<Item = Rect> {
+        self.provisional.get(&region).into_iter().flatten().copied()
+    }
+
+    /// A region's tiles are final: which of them were not before.
+    pub(super) fn settle(&mut self, region: u32) -> Vec<Rect> {
+        self.provisional.remove(&region).unwrap_or_default()
+    }
+
+    /// A core is durable.
     pub(super) fn arrived(&mut self, core: &Rect) {
-        self.regions.arrived(core);
+        if let Some(kept) = self.cores.get_mut(core) {
+            kept.counted = true;
+        }
+        let lent = self.lent.meeting(core).into_iter().filter(|(_, lent)| lent.counted).map(|(part, _)| part);
+        let lent: Vec<Rect> = lent.collect();
+        let here: Vec<Rect> = lent.iter().filter_map(|part| part.intersection(core)).collect();
+        self.regions.arrived(core, &here);
+        self.drop_lent(lent);
+    }
+
+    /// Pixels that a halo brought are durable.
+    pub(super) fn lent(&mut self, part: &Rect) {
+        let Some(lent) = self.lent.get_mut(part) else { return };
+        lent.counted = true;
+        // Cores may have come meanwhile.
+        for part in self.cores.missing_but(part, |core| core.counted) {
+            self.regions.lent(&part);
+        }
+        self.drop_lent(vec![*part]);
     }
 
     pub(super) fn finish(&mut self) {
@@ -221,14 +299,51 @@ impl Neighbors {
     }
 
     /// A region is filtered, and that is durable.
-    pub(super) fn done(&mut self, region: u32) {
-        self.regions.done(region);
-        let near = self.cores.meeting(&self.regions.window(region));
-        let near: Vec<Rect> = near.into_iter().filter(|(_, kept)| !kept.dropped).map(|(core, _)| core).collect();
+    pub(super) fn filtered(&mut self, region: u32, last: bool) {
+        let window = self.regions.window(region);
+        if last {
+            self.regions.done(region);
+            self.drop_cores(&window);
+        } else {
+            self.regions.filtered(region);
+        }
+        let lent = self.lent.meeting(&window).into_iter().map(|(part, _)| part).collect();
+        self.drop_lent(lent);
+    }
+
+    /// Drops the samples of cores around here that no region needs.
+    fn drop_cores(&mut self, window: &Rect) {
+        let near = self.cores.meeting(window).into_iter();
+        let near: Vec<Rect> = near.filter(|(_, kept)| !kept.dropped).map(|(core, _)| core).collect();
         for core in near.into_iter().filter(|core| !self.regions.need(core)) {
             if let Some(kept) = self.cores.get_mut(&core) {
                 kept.dropped = true;
+                self.room.taken = self.room.taken.saturating_sub(kept.extent.room());
                 self.file.release(&kept.extent);
+            }
+        }
+    }
+
+    /// Drops those of these lent pixels that no region needs: all cores have come, or all regions around are done.
+    fn drop_lent(&mut self, parts: Vec<Rect>) {
+        for part in parts {
+            let wanted = |kept: &Lent| {
+                let covered = self.cores.missing_but(&part, |core| core.counted).is_empty();
+                let needed = |index| match self.regions.state(index) {
+                    RegionState::Done => false,
+                    // It may be reading them.
+                    RegionState::Running => true,
+                    _ => !covered,
+                };
+                !kept.counted || self.regions.near(&part).any(needed)
+            };
+            if self.lent.get(&part).is_none_or(wanted) {
+                continue;
+            }
+            if let Some(extent) = self.lent.remove(&part).and_then(|kept| kept.extent) {
+                self.room.taken = self.room.taken.saturating_sub(extent.room());
+                self.file.release(&extent);
+                self.forgotten.push(part);
             }
         }
     }
@@ -242,6 +357,47 @@ impl Neighbors {
             Some((other, _)) => Err(StitchError::Overlap { core: *core, other: *other }.into()),
         }
     }
+
+    /// Chooses what to keep of a tile's halo: what is not there, and finds room. Until it is [returned](Self::return_lent)
+    /// or has an extent, nobody else keeps these pixels.
+    fn lend(&mut self, geometry: &TileGeometry) -> Vec<Rect> {
+        let mut parts = Vec::new();
+        let (core, window) = (geometry.core(), geometry.window());
+        for gap in window.without(&core).flat_map(|part| self.cores.missing(&part)) {
+            for part in self.lent.missing(&gap) {
+                if self.lent.len() + self.forgotten.len() < self.room.cores as usize
+                    && self.room.lend(&part, self.cores.len(), self.pixels)
+                    && self.lent.insert(part, Lent { extent: None, counted: false }).is_ok()
+                {
+                    parts.push(part);
+                }
+            }
+        }
+        parts
+    }
+
+    /// Does not keep what was chosen of a halo.
+    fn return_lent(&mut self, parts: &[Rect]) {
+        for part in parts {
+            self.lent.remove(part);
+            self.room.settle(part, None);
+        }
+    }
+
+    /// Keeps a core, and what was chosen of its halo.
+    fn insert(&mut self, core: Rect, record: &CoreRecord, lent: &[(Rect, Extent)]) {
+        let CoreRecord { digest, extent, replaced } = *record;
+        let _ = self.cores.insert(core, Core { digest, extent, counted: false, dropped: false });
+        self.pixels += core.area();
+        self.room.taken += extent.room();
+        sum(&mut self.replaced, &replaced);
+        for (part, extent) in lent {
+            if let Some(kept) = self.lent.get_mut(part) {
+                kept.extent = Some(*extent);
+                self.room.settle(part, Some(extent));
+            }
+        }
+    }
 }
 
 fn sum(all: &mut Replaced, more: &Replaced) {
@@ -251,19 +407,8 @@ fn sum(all: &mut Replaced, more: &Replaced) {
     all.film += more.film;
 }
 
-/// The parts of a rectangle whose samples have arrived and that are not on the canvas.
-fn unfiltered<T>(cores: &Coverage<T>, stitcher: &Stitcher, rect: &Rect) -> Vec<Rect> {
-    let mut absent: Coverage<()> = Coverage::default();
-    for gap in cores.missing(rect) {
-        // The gaps are apart from each other.
-        let _ = absent.insert(gap, ());
-    }
-    let present = absent.missing(rect);
-    present.iter().flat_map(|part| stitcher.missing_in(part)).collect()
-}
-
 impl Image {
-    /// Keeps the samples of a bare core.
+    /// Keeps the samples of a core, and of its halo what is not there.
     pub(super) fn keep(&self, tile: &SampleTile, digest: Digest) -> Result<Outcome, ImageError> {
         let (core, Some(announced)) = (tile.geometry().core(), &self.description.neighbors) else {
             return Ok(Outcome::Repeated);
@@ -272,151 +417,85 @@ impl Image {
         if tile.max_per_pixel() > announced.samples || tile.varying() && !announced.varying {
             return Err(announced.mismatch(core, tile.max_per_pixel().to_string()));
         }
-        let known = |image: &super::Inner| -> Result<bool, ImageError> {
-            let Some(neighbors) = &image.neighbors else { return Ok(false) };
-            if neighbors.known(&core, digest)? {
-                return Ok(true);
-            }
-            if image.finished {
-                return Err(ImageError::Finished);
-            }
-            if neighbors.cores.len() >= MAX_TILES { Err(ImageError::TooManyTiles) } else { Ok(false) }
+        let known = |neighbors: &Neighbors, finished: bool| match neighbors.known(&core, digest)? {
+            true => Ok(true),
+            false if finished => Err(ImageError::Finished),
+            false if neighbors.cores.len() >= MAX_TILES => Err(ImageError::TooManyTiles),
+            false => Ok(false),
         };
-        let file = {
-            let inner = self.read();
-            if known(&inner)? {
+        let _writer = self.writer()?;
+        let (file, lent) = {
+            let inner = &mut *self.write();
+            let Some(neighbors) = &mut inner.neighbors else { return Ok(Outcome::Repeated) };
+            if known(neighbors, inner.finished)? {
                 return Ok(Outcome::Repeated);
             }
-            inner.neighbors.as_ref().map(Neighbors::file)
+            (neighbors.file(), neighbors.lend(tile.geometry()))
         };
-        let Some(file) = file else { return Ok(Outcome::Repeated) };
-        let _writer = self.writer()?;
-        let extent = file.append(tile)?;
-        let mut inner = self.write();
+        let mut extents = Vec::with_capacity(1 + lent.len());
+        let mut append = |part: &Rect| file.append(tile, part).map(|extent| extents.push(extent));
+        let appended = append(&core).and_then(|()| lent.iter().try_for_each(append));
+        let inner = &mut *self.write();
+        let Some(neighbors) = &mut inner.neighbors else { return Ok(Outcome::Repeated) };
         // Another one may have brought it meanwhile.
-        match known(&inner) {
+        match appended.map_err(ImageError::from).and_then(|()| known(neighbors, inner.finished)) {
             Ok(false) => {}
             other => {
-                file.release(&extent);
+                extents.iter().for_each(|extent| file.release(extent));
+                neighbors.return_lent(&lent);
                 return other.map(|_| Outcome::Repeated);
             }
         }
-        let record = CoreRecord { digest, extent, replaced: tile.replaced() };
-        if let Some(neighbors) = &mut inner.neighbors {
-            let _ = neighbors.cores.insert(core, Core { digest, extent, dropped: false });
-            neighbors.pixels += core.area();
-            sum(&mut neighbors.replaced, &record.replaced);
-        }
-        inner.queue([Change::Samples(core, record.encode())], Some(After::Arrived(core)));
+        let record = CoreRecord { digest, extent: extents[0], replaced: tile.replaced() };
+        let lent: Vec<(Rect, Extent)> = lent.into_iter().zip(extents.drain(1..)).collect();
+        neighbors.insert(core, &record, &lent);
+        let changes = lent.iter().map(|(part, extent)| Change::Put(Records::Lent, *part, extent_to_bytes(extent)));
+        let changes = changes.chain([Change::Put(Records::Samples, core, record.encode())]);
+        let after = lent.iter().map(|(part, _)| After::Lent(*part)).chain([After::Arrived(core)]);
+        inner.queue(changes, after);
         Ok(Outcome::Stored)
-    }
-
-    /// The next region that can be filtered, in tiles that take at most `most` bytes each.
-    pub fn next_job(&self, threads: usize, most: u64) -> Result<Option<Job>, ImageError> {
-        self.check()?;
-        let mut inner = self.write();
-        let inner = &mut *inner;
-        let (Some(neighbors), Some(announced)) = (&mut inner.neighbors, &self.description.neighbors) else {
-            return Ok(None);
-        };
-        while let Some(region) = neighbors.regions.start_next() {
-            let mut job = Job { region, tiles: Vec::new(), bytes: 0 };
-            let mut rects = unfiltered(&neighbors.cores, &inner.stitcher, &neighbors.regions.core(region));
-            while let Some(core) = rects.pop() {
-                let reach = self.description.method.reach(announced.varying);
-                let geometry =
-                    TileGeometry::with_halo(self.description.size, core, reach).map_err(StitchError::from)?;
-                let window = geometry.window();
-                let cores = neighbors.cores.meeting(&window).into_iter();
-                let cores: Vec<_> = cores.map(|(core, kept)| (core, kept.extent)).collect();
-                // Pixels that are not there are pixels without samples.
-                let varying = announced.varying || !neighbors.cores.missing(&window).is_empty();
-                let bytes = announced.cost(&geometry, &self.description.method, threads, varying)
-                    + neighbors.file.cut_bytes(&cores);
-                if bytes <= most {
-                    job.bytes = job.bytes.max(bytes);
-                    job.tiles.push((geometry, cores));
-                } else if core.width > 1 || core.height > 1 {
-                    rects.extend(halves(core));
-                } else {
-                    neighbors.regions.give_back(region);
-                    return Err(ImageError::TooLarge { core, needed: bytes, most });
-                }
-            }
-            if !job.tiles.is_empty() {
-                neighbors.running += 1;
-                return Ok(Some(job));
-            }
-            neighbors.done(region);
-        }
-        Ok(None)
-    }
-
-    /// Filters a region, and puts it on the canvas; durable when it returns.
-    pub fn run(self: &Arc<Self>, job: &Job, pool: &ThreadPool) -> Result<(), ImageError> {
-        let done = job.tiles.iter().try_for_each(|(geometry, cores)| self.filter_part(geometry, cores, pool));
-        let mut inner = self.write();
-        if let Some(neighbors) = &mut inner.neighbors {
-            neighbors.running -= 1;
-            if done.is_err() {
-                neighbors.regions.give_back(job.region);
-            }
-        }
-        done?;
-        inner.queue([], Some(After::RegionDone(job.region)));
-        drop(inner);
-        self.flush()
-    }
-
-    /// A region that will not be filtered now.
-    pub fn give_back(&self, job: &Job) {
-        if let Some(neighbors) = &mut self.write().neighbors {
-            neighbors.running -= 1;
-            neighbors.regions.give_back(job.region);
-        }
-    }
-
-    fn filter_part(
-        self: &Arc<Self>,
-        geometry: &TileGeometry,
-        cores: &[(Rect, Extent)],
-        pool: &ThreadPool,
-    ) -> Result<(), ImageError> {
-        if self.stop.load(Ordering::Relaxed) {
-            return Err(crate::filter::Stopped.into());
-        }
-        let (file, claim) = {
-            let mut inner = self.write();
-            let Some(file) = inner.neighbors.as_ref().map(Neighbors::file) else { return Ok(()) };
-            match inner.stitcher.offer(geometry.core(), [0; 32], false)? {
-                Offer::Repeated => return Ok(()),
-                Offer::Filter(claim) => (file, Claimed { image: Arc::clone(self), claim: Some(claim) }),
-            }
-        };
-        let started = Instant::now();
-        let tile = file.cut(*geometry, cores)?;
-        let execution = Execution {
-            seed: self.description.seed,
-            pool: Some(pool),
-            stop: Some(&self.stop),
-            leave_out: self.description.leave_out,
-            ..Execution::default()
-        };
-        let filtered = filter(&tile, &self.description.method, &execution)?;
-        drop(tile);
-        self.add(claim, &filtered, started.elapsed().as_secs_f64())?;
-        Ok(())
     }
 }
 
-/// A rectangle of more than one pixel in two, across its longer side.
-fn halves(rect: Rect) -> [Rect; 2] {
-    let Rect { x, y, width, height } = rect;
-    if width >= height {
-        let left = width / 2;
-        [Rect::new(x, y, left, height), Rect::new(x + left, y, width - left, height)]
-    } else {
-        let top = height / 2;
-        [Rect::new(x, y, width, top), Rect::new(x, y + top, width, height - top)]
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        filter::{Channel, ChannelSet, Method, Role},
+        image::disk_bytes,
+    };
+
+    /// Whatever halos take, all cores that may still come have room, at their worst; and a quarter of the pixels is lent.
+    #[test]
+    fn halos_leave_room_for_all_cores() {
+        let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+        let announced = Announced { channels, samples: 3, varying: true, region: 64 };
+        let method = Method::preset("lean").unwrap();
+        let neighbors = Some(announced.clone());
+        let description = Description { size: [1024, 768], method, seed: 0, leave_out: true, neighbors, disk: 0 };
+        let description = Description { disk: disk_bytes(&description), ..description };
+        let mut room = Room::new(&description, &announced);
+        let (most, pixels) = (most_cores(description.size), 1024 * 768);
+        assert_eq!((room.cores, room.pixels), (most, pixels));
+        let (mut cores, mut brought, mut lent) = (0, 0, 0);
+        while brought < pixels {
+            // Strips as wide as a tile, until there is no room; then a core of 16 x 16.
+            let strip = Rect::new(0, 0, 64, 17);
+            while room.lend(&strip, cores, brought) {
+                lent += strip.area();
+            }
+            assert!(lent >= pixels / 4, "{lent}");
+            assert!(room.taken + announced.room(most - cores as u64, pixels - brought) <= room.all);
+            room.taken += announced.room(1, 256);
+            (cores, brought) = (cores + 1, brought + 256);
+        }
+        assert!(room.taken <= room.all);
+        // What is not kept is free again.
+        let (before, part) = (room.taken, Rect::new(0, 0, 1, 1));
+        room.all += 1 << 20;
+        assert!(room.lend(&part, cores, brought));
+        room.settle(&part, None);
+        assert_eq!(room.taken, before);
+        assert!(!Room { all: 0, ..room }.lend(&part, 0, 0));
     }
 }

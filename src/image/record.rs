@@ -23,6 +23,22 @@ pub(super) struct CoreRecord {
     pub(super) replaced: Replaced,
 }
 
+/// Where samples are.
+pub(super) fn extent_to_bytes(extent: &Extent) -> Vec<u8> {
+    let mut out = Vec::with_capacity(128);
+    out.extend_from_slice(&extent.offset.to_le_bytes());
+    out.extend_from_slice(&extent.len.to_le_bytes());
+    out.extend_from_slice(&extent.head.to_le_bytes());
+    out.extend_from_slice(&extent.check);
+    out
+}
+
+pub(super) fn extent_from_bytes(bytes: &[u8]) -> Option<Extent> {
+    let mut from = Reader(bytes);
+    let extent = from.extent()?;
+    from.0.is_empty().then_some(extent)
+}
+
 struct Reader<'a>(&'a [u8]);
 
 impl Reader<'_> {
@@ -42,6 +58,11 @@ impl Reader<'_> {
 
     fn real(&mut self) -> Option<f64> {
         self.take().map(f64::from_le_bytes)
+    }
+
+    fn extent(&mut self) -> Option<Extent> {
+        let extent = Extent { offset: self.long()?, len: self.long()?, head: self.int()?, check: self.take()? };
+        extent.possible().then_some(extent)
     }
 
     fn replaced(&mut self) -> Option<Replaced> {
@@ -106,6 +127,9 @@ impl TileRecord {
         let mut left_out = Vec::new();
         while !from.0.is_empty() {
             let [plane, reason] = from.take()?;
+            if usize::from(plane) >= channels.planes() {
+                return None;
+            }
             let reason = *LeftOutReason::ALL.get(usize::from(reason))?;
             left_out.push(LeftOut { plane: channels.plane_name(plane.into()), reason });
         }
@@ -133,19 +157,14 @@ impl CoreRecord {
     pub(super) fn encode(&self) -> Vec<u8> {
         let mut out = Vec::with_capacity(128);
         out.extend_from_slice(&self.digest);
-        out.extend_from_slice(&self.extent.offset.to_le_bytes());
-        out.extend_from_slice(&self.extent.len.to_le_bytes());
-        out.extend_from_slice(&self.extent.head.to_le_bytes());
-        out.extend_from_slice(&self.extent.check);
+        out.extend(extent_to_bytes(&self.extent));
         put_replaced(&mut out, &self.replaced);
         out
     }
 
     pub(super) fn decode(bytes: &[u8]) -> Option<Self> {
         let mut from = Reader(bytes);
-        let digest = from.take()?;
-        let extent = Extent { offset: from.long()?, len: from.long()?, head: from.int()?, check: from.take()? };
-        let record = Self { digest, extent, replaced: from.replaced()? };
+        let record = Self { digest: from.take()?, extent: from.extent()?, replaced: from.replaced()? };
         from.0.is_empty().then_some(record)
     }
 }
@@ -188,5 +207,7 @@ mod tests {
             assert!(cut % 2 == 1 && cut > 216 || TileRecord::decode(&bytes[..cut], &channels).is_none(), "{cut}");
         }
         assert_eq!(CoreRecord::decode(&core.encode()[1..]), None);
+        assert_eq!(extent_from_bytes(&extent_to_bytes(&extent)), Some(extent));
+        assert_eq!(extent_from_bytes(&core.encode()), None);
     }
 }

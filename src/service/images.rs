@@ -33,8 +33,8 @@ use super::{
 use crate::{
     admission::AdmissionError,
     filter::{Rect, TileGeometry, geometry::Halo, samples::MAX_SAMPLES_PER_PIXEL},
-    image::{Announced, Description, Image, RegionState, description::channels_from_json, disk_bytes},
-    stitch::{CanvasError, ExrOptions, Pixels, StitchError, Stitcher, StoredPixels, exr},
+    image::{Announced, Description, Image, Inner, RegionState, description::channels_from_json, disk_bytes},
+    stitch::{CanvasError, ExrOptions, Pixels, StitchError, StoredPixels, exr},
     wire::{
         Problem, TileReport,
         message::{ReplacedCounts, WorkCounts},
@@ -64,7 +64,7 @@ pub(super) fn summary(id: &Id, image: &Image) -> Value {
         "seed": description.seed,
         "parameters": description.method.parameters().into_iter().collect::<BTreeMap<_, _>>(),
         "halo": if description.neighbors.is_some() { "neighbors" } else { "client" },
-        "complete": stitcher.is_complete(),
+        "complete": inner.complete(),
         "finished": inner.finished(),
         "tiles_done": stitcher.tiles().count(),
         "pixels": stitcher.image().area(),
@@ -154,12 +154,13 @@ impl Opened {
                     RegionState::Waiting => "waiting",
                     RegionState::Ready | RegionState::Done => "ready",
                     RegionState::Running => "running",
+                    RegionState::Filtered => "filtered",
                 };
                 let mut region = json!({ "region": corners(regions.core(index)), "state": state });
-                if state == "waiting" {
-                    let absent = inner.absent(&regions.window(index));
-                    region["for"] = absent.iter().take(MAX_WAITED).map(|rect| json!(corners(*rect))).collect();
-                    region["for_regions"] = absent.len().into();
+                if ["waiting", "filtered"].contains(&state) {
+                    let awaited = inner.awaited(index);
+                    region["for"] = awaited.iter().take(MAX_WAITED).map(|rect| json!(corners(*rect))).collect();
+                    region["for_regions"] = awaited.len().into();
                 }
                 let comma = if i == 0 { "" } else { "," };
                 write!(out, "{comma}{region}")?;
@@ -181,7 +182,7 @@ impl Opened {
             let (snapshot, settled, replacements) = {
                 let inner = self.image.read();
                 let settled = inner.settled();
-                check_complete(inner.stitcher(), partial || settled && inner.finished())?;
+                check_complete(&inner, partial || settled && inner.finished())?;
                 let (pixels, missing) = (inner.stitcher().pixels(), inner.stitcher().check_complete(true)?);
                 (Snapshot { pixels, missing, stop }, settled, inner.replacements())
             };
@@ -241,16 +242,23 @@ impl Pixels for Snapshot<'_> {
     }
 }
 
-/// Refuses while pixels are missing, and says which.
-fn check_complete(stitcher: &Stitcher, partial: bool) -> Result<(), Refusal> {
-    let Err(error) = stitcher.check_complete(partial) else { return Ok(()) };
-    let regions = matches!(error, StitchError::Incomplete { .. }).then(|| stitcher.missing());
-    let mut problem = Problem::from(error);
-    if let Some(missing) = regions {
-        let listed: Value = missing.iter().take(MAX_LISTED).map(|rect| json!(corners(*rect))).collect();
-        problem = problem.with("missing", listed).with("missing_regions", missing.len());
-        problem.detail += "; ?partial=true gives what there is";
+/// Refuses while pixels are missing or not final, and says which.
+fn check_complete(inner: &Inner, partial: bool) -> Result<(), Refusal> {
+    if partial || inner.complete() {
+        return Ok(());
     }
+    let (mut missing, all) = (inner.stitcher().missing(), inner.regions());
+    if let (true, Some(regions)) = (missing.is_empty(), all) {
+        // They are there, but not from all that they are to be filtered from.
+        let open = (0..regions.count()).filter(|&index| regions.state(index) != RegionState::Done);
+        missing = open.map(|index| regions.core(index)).collect();
+    }
+    let pixels = missing.iter().map(Rect::area).sum();
+    let first = missing.first().copied().unwrap_or_else(|| inner.stitcher().image());
+    let mut problem = Problem::from(StitchError::Incomplete { pixels, first });
+    let listed: Value = missing.iter().take(MAX_LISTED).map(|rect| json!(corners(*rect))).collect();
+    problem = problem.with("missing", listed).with("missing_regions", missing.len());
+    problem.detail += "; ?partial=true gives what there is";
     Err(problem.into())
 }
 

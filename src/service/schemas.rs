@@ -114,7 +114,7 @@ schemas! {
         /// With `neighbors`: regions in all.
         #[schema(nullable = false)]
         regions: Option<u64>,
-        /// With `neighbors`: regions that are not filtered yet.
+        /// With `neighbors`: regions that are not filtered for good yet.
         #[schema(nullable = false)]
         regions_open: Option<u64>,
         /// Which file is damaged, if one is.
@@ -122,16 +122,16 @@ schemas! {
         damaged: Option<String>,
     }
 
-    /// A region that is not filtered yet.
+    /// A region that is not filtered for good yet.
     struct WaitingRegion {
         /// The region: x, y, width, height.
         region: [u32; 4],
-        /// `waiting`, `ready` or `running`.
+        /// `waiting`, `ready`, `running`, or `filtered` from pixels whose cores have not come.
         state: String,
-        /// If it waits: what is missing of the pixels that it reads, the first 16.
+        /// If it is `waiting`: what is missing of the pixels that it reads; if `filtered`, of their cores; the first 16.
         #[schema(nullable = false)]
         r#for: Option<Vec<[u32; 4]>>,
-        /// If it waits: how many there are.
+        /// The same: how many there are.
         #[schema(nullable = false)]
         for_regions: Option<u64>,
     }
@@ -341,7 +341,7 @@ sharing! {
         /// With `neighbors`: regions in all.
         #[schema(nullable = false)]
         regions: Option<u64>,
-        /// With `neighbors`: regions that are not filtered yet.
+        /// With `neighbors`: regions that are not filtered for good yet.
         #[schema(nullable = false)]
         regions_open: Option<u64>,
 
@@ -358,7 +358,7 @@ sharing! {
         tiles: Vec<TileStatus>,
         /// Sums of the tiles' reports.
         totals: Totals,
-        /// With `neighbors`: the regions that are not filtered, by rows.
+        /// With `neighbors`: the regions that are not filtered for good, by rows.
         #[schema(nullable = false)]
         waiting: Option<Vec<WaitingRegion>>,
         /// With `neighbors`: what keeps regions from being filtered, until it is tried again.

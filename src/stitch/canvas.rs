@@ -114,9 +114,13 @@ impl Canvas {
     pub fn open(width: u32, height: u32, folder: &dyn Folder, name: &str) -> Result<Self, CanvasError> {
         let path = folder.path().join(name);
         let io = |source| CanvasError::Io { action: "open", path: path.clone(), source };
-        let file = folder.open(name).map_err(io)?;
-        let (got, image) = (file.len().map_err(io)?, Rect::new(0, 0, width, height));
+        let image = Rect::new(0, 0, width, height);
         let expected = image.area() * PIXEL;
+        let file = folder.open(name).map_err(|source| match source.kind() {
+            io::ErrorKind::NotFound => CanvasError::Length { path: path.clone(), got: 0, expected },
+            _ => io(source),
+        })?;
+        let got = file.len().map_err(io)?;
         if got != expected {
             return Err(CanvasError::Length { path, got, expected });
         }

@@ -1,7 +1,7 @@
 //! Whether two tiles bring the same samples.
 
 use super::Digest;
-use crate::filter::{Role, SampleTile};
+use crate::filter::{Rect, Role, SampleTile};
 
 /// The digest of a core's samples: where the core lies, the channels, the sample counts, and every value, by rows.
 ///
@@ -9,7 +9,16 @@ use crate::filter::{Role, SampleTile};
 /// was replaced by, and missing features (NaN) are all equal, whatever a component that is constant in the data window
 /// holds for them. Takes one pass over the core's samples and 64 KiB.
 pub fn digest(tile: &SampleTile) -> Digest {
-    let (image, core, window) = (tile.geometry().image(), tile.geometry().core(), tile.geometry().window());
+    digest_of(tile, tile.geometry().core())
+}
+
+/// The same of all the data window's samples: of what decides what becomes of the core.
+pub fn window_digest(tile: &SampleTile) -> Digest {
+    digest_of(tile, tile.geometry().window())
+}
+
+fn digest_of(tile: &SampleTile, core: Rect) -> Digest {
+    let (image, window) = (tile.geometry().image(), tile.geometry().window());
     let mut out = Hasher { hash: blake3::Hasher::new(), bytes: Vec::with_capacity(1 << 16) };
     out.numbers([image.width, image.height, core.x, core.y, core.width, core.height]);
     out.number(tile.channels().channels().len() as u32);
@@ -68,7 +77,7 @@ impl Hasher {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::filter::{Channel, ChannelSet, Counts, Execution, Plane, Rect, TileGeometry};
+    use crate::filter::{Channel, ChannelSet, Counts, Execution, Plane, TileGeometry};
     use crate::synth::Scene;
 
     fn scene(core: Rect, halo: u32, seed: u64) -> SampleTile {
@@ -83,6 +92,8 @@ mod tests {
         assert_eq!(bare, digest(&scene(core, 5, 1)));
         assert_ne!(bare, digest(&scene(core, 0, 2)));
         assert_ne!(bare, digest(&scene(Rect::new(10, 12, 7, 9), 0, 1)));
+        assert_eq!(bare, window_digest(&scene(core, 0, 1)));
+        assert_ne!(window_digest(&scene(core, 5, 1)), window_digest(&scene(core, 4, 1)));
     }
 
     fn small(name: &str, counts: Counts, values: [Plane; 4]) -> Digest {

@@ -28,7 +28,7 @@ pub mod digest;
 pub mod exr;
 
 pub use canvas::{Canvas, CanvasError, Pixels, RgbImage};
-pub use digest::digest;
+pub use digest::{digest, window_digest};
 pub use exr::{ExrCompression, ExrError, ExrLayout, ExrOptions, ExrSamples, ExrSummary};
 
 use crate::filter::{

@@ -1,4 +1,4 @@
-//! Cuts tiles of any geometry from stored cores.
+//! Cuts tiles of any geometry from stored rectangles of pixels.
 
 use std::{io, ops::Range};
 
@@ -8,7 +8,7 @@ use crate::filter::{
     samples::{SampleError, sample_total},
 };
 
-/// The samples of one stored core. Pixels are counted by rows of the core.
+/// The samples of a stored rectangle. Pixels are counted by its rows.
 pub(super) trait Part {
     /// Samples of each pixel, if all have as many.
     fn uniform(&self) -> Option<u32>;
@@ -16,7 +16,7 @@ pub(super) trait Part {
     /// Samples of the pixels from this one on, where they vary.
     fn counts(&self, pixel: u64, into: &mut [u16]) -> io::Result<()>;
 
-    /// The samples ahead of those of a row of the core, where they vary.
+    /// The samples ahead of those of a row, where they vary.
     fn row_start(&self, row: u32) -> io::Result<u64>;
 
     /// The value of a plane that has only one.
@@ -26,31 +26,38 @@ pub(super) trait Part {
     fn values(&self, plane: usize, sample: u64, into: &mut [f32]) -> io::Result<()>;
 }
 
-/// A tile of this geometry from the cores that have pixels in its window; pixels of none of them are pixels without
+/// A stored rectangle, and the part of it that is meant.
+pub(super) struct Piece<P> {
+    pub(super) stored: Rect,
+    pub(super) used: Rect,
+    pub(super) part: P,
+}
+
+/// A tile of this geometry from pieces, the used parts of which do not overlap; pixels of none of them are pixels without
 /// samples. Memory: the tile, 4 bytes a pixel, and a row of samples.
 pub(super) fn cut<P: Part>(
     geometry: TileGeometry,
     channels: &ChannelSet,
-    parts: &[(Rect, P)],
+    pieces: &[Piece<P>],
 ) -> Result<SampleTile, SpoolError> {
     let window = geometry.window();
-    let layout = Layout::new(&window, parts)?;
-    let planes = (0..channels.planes()).map(|plane| cut_plane(&window, parts, &layout, plane));
+    let layout = Layout::new(&window, pieces)?;
+    let planes = (0..channels.planes()).map(|plane| cut_plane(&window, pieces, &layout, plane));
     let planes = planes.collect::<io::Result<Vec<_>>>()?;
     Ok(SampleTile::new(geometry, channels.clone(), layout.counts, planes)?)
 }
 
-fn cut_plane<P: Part>(window: &Rect, parts: &[(Rect, P)], layout: &Layout, plane: usize) -> io::Result<Plane> {
-    if let Some(value) = parts.first().and_then(|(_, part)| part.constant(plane)) {
+fn cut_plane<P: Part>(window: &Rect, pieces: &[Piece<P>], layout: &Layout, plane: usize) -> io::Result<Plane> {
+    if let Some(value) = pieces.first().and_then(|piece| piece.part.constant(plane)) {
         let same = |other: f32| other == value || (other.is_nan() && value.is_nan());
-        if parts.iter().all(|(_, part)| part.constant(plane).is_some_and(same)) {
+        if pieces.iter().all(|piece| piece.part.constant(plane).is_some_and(same)) {
             return Ok(Plane::Constant(value));
         }
     }
     let mut values = vec![0.0; layout.total];
     let mut counts = Vec::new();
-    for (core, part) in parts {
-        let Some(here) = core.intersection(window) else { continue };
+    for Piece { stored, used, part } in pieces {
+        let Some(here) = used.intersection(window) else { continue };
         for y in here.y..here.bottom() {
             let into = layout.range(window, here.x, here.right(), y);
             let into = &mut values[into];
@@ -59,11 +66,11 @@ fn cut_plane<P: Part>(window: &Rect, parts: &[(Rect, P)], layout: &Layout, plane
                 continue;
             }
             let from = match part.uniform() {
-                Some(n) => core.index(here.x, y) as u64 * u64::from(n),
+                Some(n) => stored.index(here.x, y) as u64 * u64::from(n),
                 None => {
-                    counts.resize((here.x - core.x) as usize, 0);
-                    part.counts(core.index(core.x, y) as u64, &mut counts)?;
-                    part.row_start(y - core.y)? + sum(&counts) as u64
+                    counts.resize((here.x - stored.x) as usize, 0);
+                    part.counts(stored.index(stored.x, y) as u64, &mut counts)?;
+                    part.row_start(y - stored.y)? + sum(&counts) as u64
                 }
             };
             part.values(plane, from, into)?;
@@ -81,22 +88,22 @@ struct Layout {
 }
 
 impl Layout {
-    fn new<P: Part>(window: &Rect, parts: &[(Rect, P)]) -> Result<Self, SpoolError> {
-        let first = parts.first().and_then(|(_, part)| part.uniform());
+    fn new<P: Part>(window: &Rect, pieces: &[Piece<P>]) -> Result<Self, SpoolError> {
+        let first = pieces.first().and_then(|piece| piece.part.uniform());
         let counts = match first {
-            Some(n) if parts.iter().all(|(_, part)| part.uniform() == first) && covered(window, parts) => {
+            Some(n) if pieces.iter().all(|piece| piece.part.uniform() == first) && covered(window, pieces) => {
                 Counts::Uniform(n)
             }
             _ => {
                 let mut counts = vec![0; window.area() as usize];
-                for (core, part) in parts {
-                    let Some(here) = core.intersection(window) else { continue };
+                for Piece { stored, used, part } in pieces {
+                    let Some(here) = used.intersection(window) else { continue };
                     for y in here.y..here.bottom() {
                         let at = window.index(here.x, y);
                         let row = &mut counts[at..at + here.width as usize];
                         match part.uniform() {
                             Some(n) => row.fill(n as u16),
-                            None => part.counts(core.index(here.x, y) as u64, row)?,
+                            None => part.counts(stored.index(here.x, y) as u64, row)?,
                         }
                     }
                 }
@@ -131,9 +138,9 @@ impl Layout {
     }
 }
 
-/// Whether these cores, which do not overlap, cover all of a window.
-fn covered<P>(window: &Rect, parts: &[(Rect, P)]) -> bool {
-    let areas = parts.iter().filter_map(|(core, _)| core.intersection(window));
+/// Whether these pieces cover all of a window.
+fn covered<P>(window: &Rect, pieces: &[Piece<P>]) -> bool {
+    let areas = pieces.iter().filter_map(|piece| piece.used.intersection(window));
     areas.map(|part| part.area()).sum::<u64>() == window.area()
 }
 

@@ -10,6 +10,6 @@ pub mod samples;
 pub mod spool;
 pub mod state;
 
-pub use samples::{Extent, SampleFile};
+pub use samples::{Extent, SampleFile, Source};
 pub use spool::{Spool, SpoolError};
-pub use state::{Change, State, StateError};
+pub use state::{Change, Records, State, StateError};

@@ -9,11 +9,11 @@ use std::{cell::RefCell, io, path::PathBuf, sync::Arc};
 
 use super::{
     SpoolError,
-    cut::{Part, cut},
+    cut::{Part, Piece, cut},
 };
 use crate::{
     disk::{Folder, Storage},
-    filter::{ChannelSet, Plane, Rect, SampleTile, TileGeometry},
+    filter::{ChannelSet, Plane, Rect, SampleTile, TileGeometry, samples::MAX_SAMPLES_PER_PIXEL},
 };
 
 /// Name of the file in its folder.
@@ -40,14 +40,41 @@ pub struct Extent {
     pub check: [u8; 16],
 }
 
+impl Extent {
+    /// Whether there could be such a one.
+    pub fn possible(&self) -> bool {
+        let end = self.offset.checked_add(self.len).is_some_and(|end| end < i64::MAX as u64 - PAGE);
+        end && self.offset.is_multiple_of(PAGE) && u64::from(self.head) <= self.len
+    }
+
+    /// Bytes of disk that it takes.
+    pub const fn room(&self) -> u64 {
+        self.len.next_multiple_of(PAGE)
+    }
+}
+
+/// Stored samples, and those pixels of them that are meant.
+#[derive(Clone, Copy, Debug)]
+pub struct Source {
+    /// The pixels whose samples are stored.
+    pub stored: Rect,
+    /// Where they are.
+    pub extent: Extent,
+    /// Pixels among them.
+    pub used: Rect,
+}
+
 /// Bytes of disk that the samples of `cores` cores take at most, which have so many pixels and samples in all.
 pub fn worst_case(cores: u64, pixels: u64, samples: u64, planes: usize, varying: bool) -> u64 {
     // A frame is at most a 256th longer than what is in it, and a few bytes; its length is in the head.
-    let stored = |bytes: u64, values: u64| bytes + bytes / 256 + (80 + 4) * values.div_ceil(BLOCK);
-    let counts = if varying { stored(2 * pixels, pixels) } else { 0 };
+    let stored = |size: u64, values: u64| {
+        let bytes = values.saturating_mul(size);
+        bytes.saturating_add(bytes / 256 + (80 + 4) * values.div_ceil(BLOCK))
+    };
+    let counts = if varying { stored(2, pixels) } else { 0 };
     // Each core may begin a block and a page.
     let per_core = PAGE + 5 + (planes as u64 + 1) * (80 + 4 + 5);
-    counts + stored(4 * samples, samples) * planes as u64 + cores * per_core
+    stored(4, samples).saturating_mul(planes as u64).saturating_add(counts).saturating_add(cores * per_core)
 }
 
 /// The file.
@@ -68,10 +95,19 @@ impl SampleFile {
         Ok(Self { file, path, channels, end: 0.into() })
     }
 
-    /// A file that was made before. What is in none of these extents is given back.
-    pub fn open(folder: &dyn Folder, channels: ChannelSet, mut extents: Vec<Extent>) -> io::Result<Self> {
+    /// A file that was made before; [`Self::keep`] is to be called before anything is appended.
+    pub fn open(folder: &dyn Folder, channels: ChannelSet) -> io::Result<Self> {
         let path = folder.path().join(SAMPLES_FILE);
-        let file = folder.open(SAMPLES_FILE).map_err(|error| named(&path, error))?;
+        let file = folder.open(SAMPLES_FILE).map_err(|error| match error.kind() {
+            io::ErrorKind::NotFound => named(&path, io::Error::new(io::ErrorKind::InvalidData, "it is missing")),
+            _ => named(&path, error),
+        })?;
+        Ok(Self { file, path, channels, end: 0.into() })
+    }
+
+    /// Gives back what is in none of these extents.
+    pub fn keep(&self, mut extents: Vec<Extent>) -> io::Result<()> {
+        let Self { file, path, .. } = self;
         extents.sort_unstable_by_key(|extent| extent.offset);
         let mut end = 0u64;
         for extent in &extents {
@@ -81,52 +117,52 @@ impl SampleFile {
             }
             end = (extent.offset + extent.len).next_multiple_of(PAGE);
         }
-        let len = file.len().map_err(|error| named(&path, error))?;
+        let len = file.len().map_err(|error| named(path, error))?;
         let needed = extents.last().map_or(0, |extent| extent.offset + extent.len);
         if len < needed {
             let why = format!("it has {len} bytes, but {needed} were written");
-            return Err(named(&path, io::Error::new(io::ErrorKind::InvalidData, why)));
+            return Err(named(path, io::Error::new(io::ErrorKind::InvalidData, why)));
         }
-        file.set_len(needed).map_err(|error| named(&path, error))?;
-        Ok(Self { file, path, channels, end: end.into() })
+        file.set_len(needed).map_err(|error| named(path, error))?;
+        *self.end.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = end;
+        Ok(())
     }
 
-    /// Writes the samples of a tile's core. They are durable after [`Self::sync`].
-    pub fn append(&self, tile: &SampleTile) -> io::Result<Extent> {
-        let core = tile.geometry().core();
+    /// Writes a tile's samples of a part of its data window. They are durable after [`Self::sync`].
+    pub fn append(&self, tile: &SampleTile, part: &Rect) -> io::Result<Extent> {
         let window = tile.geometry().window();
-        let rows = || (core.y..core.bottom()).map(|y| (window.index(core.x, y), window.index(core.right() - 1, y)));
+        let rows = || (part.y..part.bottom()).map(|y| (window.index(part.x, y), window.index(part.right() - 1, y)));
         let samples: u64 = rows().map(|(a, b)| (tile.samples_of(b).end - tile.samples_of(a).start) as u64).sum();
-        let room = worst_case(1, core.area(), samples, self.channels.planes(), tile.varying());
+        let room = worst_case(1, part.area(), samples, self.channels.planes(), tile.varying());
         let room = room.next_multiple_of(PAGE);
         let offset = {
             let mut end = self.end.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
             *end += room;
             *end - room
         };
-        let written = self.write_core(tile, offset, samples);
+        let written = self.write_part(tile, part, offset, samples);
         written.map_err(|error| {
             self.file.release(offset, room);
             named(&self.path, error)
         })
     }
 
-    fn write_core(&self, tile: &SampleTile, offset: u64, samples: u64) -> io::Result<Extent> {
-        let (core, window) = (tile.geometry().core(), tile.geometry().window());
-        let pixels = |y| window.index(core.x, y)..window.index(core.x, y) + core.width as usize;
+    fn write_part(&self, tile: &SampleTile, part: &Rect, offset: u64, samples: u64) -> io::Result<Extent> {
+        let window = tile.geometry().window();
+        let pixels = |y| window.index(part.x, y)..window.index(part.x, y) + part.width as usize;
         let tables: u64 = (0..self.channels.planes())
             .map(|plane| match tile.plane(plane) {
                 Plane::Constant(_) => 5,
                 Plane::Values(_) => 1 + 4 * samples.div_ceil(BLOCK),
             })
             .sum();
-        let counts = if tile.varying() { 4 * core.area().div_ceil(BLOCK) } else { 0 };
+        let counts = if tile.varying() { 4 * part.area().div_ceil(BLOCK) } else { 0 };
         let mut head = Vec::with_capacity((5 + counts + tables) as usize);
         let mut out = BlockWriter::new(&*self.file, offset + 5 + counts + tables)?;
         if tile.varying() {
             head.push(1);
             head.extend_from_slice(&[0; 4]);
-            for y in core.y..core.bottom() {
+            for y in part.y..part.bottom() {
                 pixels(y).try_for_each(|p| out.push(&(tile.samples_of(p).len() as u16).to_le_bytes(), &mut head))?;
             }
             out.end(&mut head)?;
@@ -142,7 +178,7 @@ impl SampleFile {
                 }
                 Plane::Values(values) => {
                     head.push(1);
-                    for y in core.y..core.bottom() {
+                    for y in part.y..part.bottom() {
                         let row = pixels(y);
                         let row = tile.samples_of(row.start).start..tile.samples_of(row.end - 1).end;
                         values[row].iter().try_for_each(|value| out.push(&value.to_le_bytes(), &mut head))?;
@@ -167,28 +203,28 @@ impl SampleFile {
         self.file.release(start, end.saturating_sub(start));
     }
 
-    /// A tile of this geometry, from the cores that have pixels in its window; pixels of none of them are pixels without
+    /// A tile of this geometry, from sources whose used pixels do not overlap; pixels of none of them are pixels without
     /// samples.
-    pub fn cut(&self, geometry: TileGeometry, cores: &[(Rect, Extent)]) -> Result<SampleTile, SpoolError> {
+    pub fn cut(&self, geometry: TileGeometry, sources: &[Source]) -> Result<SampleTile, SpoolError> {
         let reader = Reader { file: &*self.file, cache: RefCell::default() };
-        let parts = cores.iter().map(|(core, extent)| {
-            let part = StoredPart::open(&reader, *core, extent, self.channels.planes());
-            Ok((*core, part.map_err(|error| named(&self.path, error))?))
+        let pieces = sources.iter().map(|&Source { stored, extent, used }| {
+            let part = StoredPart::open(&reader, stored, &extent, self.channels.planes());
+            Ok(Piece { stored, used, part: part.map_err(|error| named(&self.path, error))? })
         });
-        let parts = parts.collect::<io::Result<Vec<_>>>()?;
-        cut(geometry, &self.channels, &parts).map_err(|error| match error {
+        let pieces = pieces.collect::<io::Result<Vec<_>>>()?;
+        cut(geometry, &self.channels, &pieces).map_err(|error| match error {
             SpoolError::Io(error) => named(&self.path, error).into(),
             error => error,
         })
     }
 
     /// Memory that [`Self::cut`] takes at most beside the tile itself.
-    pub fn cut_bytes(&self, cores: &[(Rect, Extent)]) -> u64 {
+    pub fn cut_bytes(&self, sources: &[Source]) -> u64 {
         let per_part = 256 + 64 * self.channels.planes() as u64;
         BUFFERS
-            + cores
+            + sources
                 .iter()
-                .map(|(core, extent)| per_part + 3 * u64::from(extent.head) + 8 * u64::from(core.height))
+                .map(|from| per_part + 3 * u64::from(from.extent.head) + 8 * u64::from(from.stored.height))
                 .sum::<u64>()
     }
 }
@@ -336,7 +372,7 @@ impl<'a> StoredPart<'a> {
         let mut part = Self { reader, uniform: None, counts: Blocks::default(), rows: Vec::new(), planes: Vec::new() };
         let mut samples = 0;
         match (byte(&mut head), number(&mut head)) {
-            (Some(0), Some(n)) => {
+            (Some(0), Some(n)) if n <= MAX_SAMPLES_PER_PIXEL => {
                 part.uniform = Some(n);
                 samples += core.area() * u64::from(n);
             }
@@ -380,7 +416,9 @@ fn number(head: &mut &[u8]) -> Option<u32> {
 fn blocks(head: &mut &[u8], at: &mut u64, values: u64) -> Option<Blocks> {
     let mut starts = vec![*at];
     for _ in 0..values.div_ceil(BLOCK) {
-        *at += u64::from(number(head)?);
+        let compressed =
+            number(head).filter(|&bytes| bytes as usize <= zstd::zstd_safe::compress_bound(4 * BLOCK as usize))?;
+        *at += u64::from(compressed);
         starts.push(*at);
     }
     Some(Blocks { starts, values })

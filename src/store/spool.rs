@@ -11,7 +11,7 @@ use std::{io, path::Path};
 
 use super::{
     backing::Backing,
-    cut::{Part, cut},
+    cut::{Part, Piece, cut},
 };
 use crate::{
     filter::{ChannelSet, Coverage, Rect, SampleTile, TileGeometry, samples::SampleError},
@@ -327,7 +327,8 @@ impl Spool {
         }
         let backing = &self.backing;
         let meeting = self.tiles.meeting(&window).into_iter();
-        let parts: Vec<_> = meeting.map(|(core, stored)| (core, SpoolPart { stored, backing })).collect();
+        let piece = |(core, stored)| Piece { stored: core, used: core, part: SpoolPart { stored, backing } };
+        let parts: Vec<_> = meeting.map(piece).collect();
         cut(geometry, channels, &parts)
     }
 }

@@ -25,8 +25,6 @@ pub const STATE_BYTES: (u64, u64) = (4 << 20, 1 << 10);
 
 type Key = (u32, u32, u32, u32);
 const FACTS: TableDefinition<&str, &[u8]> = TableDefinition::new("facts");
-const TILES: TableDefinition<Key, &[u8]> = TableDefinition::new("tiles");
-const SAMPLES: TableDefinition<Key, &[u8]> = TableDefinition::new("samples");
 
 /// A store that cannot be read or written.
 #[derive(Clone, Debug, thiserror::Error)]
@@ -70,10 +68,36 @@ pub enum Change {
     Fact(&'static str, Vec<u8>),
     /// A fact is no more.
     Forget(&'static str),
-    /// A filtered tile.
-    Tile(Rect, Vec<u8>),
-    /// The samples of a core.
-    Samples(Rect, Vec<u8>),
+    /// A record of a rectangle of pixels, in the place of the one that there may be.
+    Put(Records, Rect, Vec<u8>),
+    /// A record is no more, if there was one.
+    Remove(Records, Rect),
+}
+
+/// Records of rectangles of pixels, by what they tell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Records {
+    /// Filtered tiles.
+    Tiles,
+    /// The samples of cores.
+    Samples,
+    /// Samples that a halo brought.
+    Lent,
+    /// Tiles, filtered from such samples, that are not final.
+    Provisional,
+}
+
+impl Records {
+    const ALL: [Self; 4] = [Self::Tiles, Self::Samples, Self::Lent, Self::Provisional];
+
+    const fn table(self) -> TableDefinition<'static, Key, &'static [u8]> {
+        TableDefinition::new(match self {
+            Self::Tiles => "tiles",
+            Self::Samples => "samples",
+            Self::Lent => "lent",
+            Self::Provisional => "provisional",
+        })
+    }
 }
 
 /// The store of one image.
@@ -123,14 +147,20 @@ impl State {
             let transaction = self.database.begin_write()?;
             {
                 let mut facts = transaction.open_table(FACTS)?;
-                let mut tiles = transaction.open_table(TILES)?;
-                let mut samples = transaction.open_table(SAMPLES)?;
+                // All of them are there from the first commit on.
+                for records in Records::ALL {
+                    drop(transaction.open_table(records.table())?);
+                }
                 for change in changes {
                     match change {
                         Change::Fact(name, value) => drop(facts.insert(*name, &value[..])?),
                         Change::Forget(name) => drop(facts.remove(*name)?),
-                        Change::Tile(core, value) => drop(tiles.insert(corners(core), &value[..])?),
-                        Change::Samples(core, value) => drop(samples.insert(corners(core), &value[..])?),
+                        Change::Put(records, rect, value) => {
+                            drop(transaction.open_table(records.table())?.insert(corners(rect), &value[..])?);
+                        }
+                        Change::Remove(records, rect) => {
+                            drop(transaction.open_table(records.table())?.remove(corners(rect))?);
+                        }
                     }
                 }
             }
@@ -146,22 +176,20 @@ impl State {
         })
     }
 
-    /// Reads all tiles, by rows.
-    pub fn tiles(&self, take: impl FnMut(Rect, &[u8])) -> Result<(), StateError> {
-        self.each(TILES, take)
-    }
-
-    /// Reads the samples of all cores, by rows.
-    pub fn samples(&self, take: impl FnMut(Rect, &[u8])) -> Result<(), StateError> {
-        self.each(SAMPLES, take)
-    }
-
-    fn each(&self, table: TableDefinition<Key, &[u8]>, mut take: impl FnMut(Rect, &[u8])) -> Result<(), StateError> {
+    /// Reads all of some records, by rows.
+    pub fn each(&self, records: Records, mut take: impl FnMut(Rect, &[u8])) -> Result<(), StateError> {
         guarded(&self.path, || {
-            let table = self.database.begin_read()?.open_table(table)?;
+            let table = match self.database.begin_read()?.open_table(records.table()) {
+                // An earlier version had fewer.
+                Err(redb::TableError::TableDoesNotExist(_)) => return Ok(()),
+                table => table?,
+            };
             for entry in table.iter()? {
                 let (key, value) = entry?;
                 let (y, x, width, height) = key.value();
+                if width == 0 || height == 0 || x.checked_add(width).is_none() || y.checked_add(height).is_none() {
+                    return Err(redb::Error::Corrupted(format!("a record of no pixels: {:?}", key.value())));
+                }
                 take(Rect::new(x, y, width, height), value.value());
             }
             Ok(())
@@ -229,12 +257,12 @@ mod tests {
     use crate::disk::Directory;
 
     fn tile(x: u32) -> Change {
-        Change::Tile(Rect::new(x, 7, 16, 16), vec![x as u8; 100])
+        Change::Put(Records::Tiles, Rect::new(x, 7, 16, 16), vec![x as u8; 100])
     }
 
     fn read(state: &State) -> Vec<(u32, Vec<u8>)> {
         let mut all = Vec::new();
-        state.tiles(|rect, value| all.push((rect.x, value.to_vec()))).unwrap();
+        state.each(Records::Tiles, |rect, value| all.push((rect.x, value.to_vec()))).unwrap();
         all
     }
 

@@ -2,7 +2,7 @@
 
 use super::{Random, rounds};
 use crate::{
-    service::{Server, exact::whole_exr, head, neighbors, samples, tile},
+    service::{Server, contradicting, encode, exact::whole_exr, head, neighbors, samples, tile},
     stitch::shuffle,
 };
 use rpfd::filter::{Method, Rect, geometry::tiling};
@@ -111,12 +111,19 @@ fn killed_at_random_points_the_image_is_the_same() {
     let cores: Vec<Rect> = tiling(size, 40).collect();
     let with_halo = |halo: u32| cores.iter().map(|&core| (core, tile(size, core, halo))).collect::<Vec<_>>();
     let (bare, full) = (with_halo(0), with_halo(17));
+    // A third without a halo, a third with one, a third with one of other samples than the cores bring.
+    let mixed = cores.iter().enumerate().map(|(i, &core)| match i % 3 {
+        0 => bare[i].clone(),
+        1 => full[i].clone(),
+        _ => (core, encode(&contradicting(size, core, 17))),
+    });
+    let mixed: Vec<_> = mixed.collect();
     let mut kills = 0;
     for seed in rounds(3) {
-        let by = if seed % 2 == 0 { "client halos" } else { "neighbours" };
-        let n = match seed % 2 {
-            0 => round(seed, side, client.as_bytes(), &full, &expected),
-            _ => round(seed, side, &neighbors, &bare, &expected),
+        let (by, n) = match seed % 3 {
+            0 => ("client halos", round(seed, side, client.as_bytes(), &full, &expected)),
+            1 => ("neighbours", round(seed, side, &neighbors, &bare, &expected)),
+            _ => ("both", round(seed, side, &neighbors, &mixed, &expected)),
         };
         println!("seed {seed}, {by}: {n} kills");
         kills += n;

@@ -64,6 +64,13 @@ fn the_python_client_has_an_image_stitched() {
     assert!(output.status.success());
     assert!(bytes(&out) == bytes(ours), "the two EXRs differ");
     assert_eq!(server.get("/v1/images").json()["images"].as_array().unwrap().len(), 0);
+    // The same from bare cores, of which one brings some halo.
+    let cores = [(Rect::new(0, 0, 20, 24), 3), (Rect::new(20, 0, 12, 24), 0)];
+    std::fs::write(&input, cores.map(|(core, halo)| tile([32, 24], core, halo)).concat()).unwrap();
+    let (neighbors, bare) = (format!("{url}&halo=neighbors"), folder.path("bare.exr"));
+    let args: [&Path; 4] = ["images".as_ref(), neighbors.as_ref(), input.as_ref(), bare.as_ref()];
+    assert!(python("numpy, msgpack", CLIENT, &args).unwrap().status.success());
+    assert!(bytes(&bare) == bytes(&out), "bare cores give another EXR");
     // A tile that is refused: no EXR.
     let missing = folder.path("none.exr");
     let overlap = [tile([32, 24], Rect::new(0, 0, 32, 24), 0), encode(&samples([32, 24], Rect::new(1, 1, 4, 4), 0, 1))];

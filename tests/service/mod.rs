@@ -28,7 +28,7 @@ use std::{
 };
 
 use rpfd::{
-    filter::{Execution, Rect, SampleTile, TileGeometry},
+    filter::{Counts, Execution, Plane, Rect, SampleTile, TileGeometry},
     synth::Scene,
     wire::{Format, Header, Message, ResultDecoder, encode_tile},
 };
@@ -281,6 +281,21 @@ pub(crate) fn samples(image: [u32; 2], core: Rect, halo: u32, seed: u64) -> Samp
     let geometry = TileGeometry::with_halo(image, core, halo).unwrap();
     let execution = Execution { seed, ..Execution::default() };
     Scene::by_name("all").unwrap().tile(geometry, 4, &execution).unwrap()
+}
+
+/// The same with a halo whose samples are others than those of the cores around it.
+pub(crate) fn contradicting(image: [u32; 2], core: Rect, halo: u32) -> SampleTile {
+    let [right, wrong] = [1, 2].map(|seed| samples(image, core, halo, seed));
+    let window = right.geometry().window();
+    let pixels = (window.y..window.bottom()).flat_map(|y| (window.x..window.right()).map(move |x| (x, y)));
+    let owners: Vec<&SampleTile> = pixels.map(|(x, y)| if core.contains(x, y) { &right } else { &wrong }).collect();
+    let plane = |plane| {
+        let samples =
+            owners.iter().enumerate().flat_map(|(pixel, tile)| right.samples_of(pixel).map(move |s| (tile, s)));
+        Plane::Values(samples.map(|(tile, sample)| tile.value(plane, sample)).collect())
+    };
+    let planes = (0..right.channels().planes()).map(plane).collect();
+    SampleTile::new(*right.geometry(), right.channels().clone(), Counts::Uniform(4), planes).unwrap()
 }
 
 pub(crate) fn encode(tile: &SampleTile) -> Vec<u8> {

@@ -1,6 +1,6 @@
 //! Images whose tiles come as bare cores, and lend each other their halos.
 
-use super::{Server, encode, exact::whole_exr, samples, tile, wait_for};
+use super::{Server, contradicting, encode, exact::whole_exr, samples, tile, wait_for};
 use crate::stitch::shuffle;
 use rpfd::{
     filter::{Execution, Method, Rect, SampleTile, TileGeometry, filter, geometry::tiling},
@@ -11,6 +11,7 @@ use rpfd::{
     wire::{Decoder, Event},
 };
 use serde_json::{Value, json};
+use std::os::unix::fs::MetadataExt;
 
 /// What opens an image of this scene's tiles.
 pub(crate) fn opening(id: &str, size: [u32; 2], preset: &str, samples: (&str, u32)) -> Vec<u8> {
@@ -45,7 +46,7 @@ fn bare_cores_in_any_order_are_the_whole_image() {
         open(&server, SIZE, preset);
         let mut cores: Vec<Rect> = tiling(SIZE, side).collect();
         shuffle(&mut cores, u64::from(side));
-        // Some bring a halo nobody needs.
+        // Some bring a halo.
         let halo = |i: usize| if i.is_multiple_of(3) { 3 } else { 0 };
         let bodies: Vec<Vec<u8>> = cores.iter().enumerate().map(|(i, &core)| tile(SIZE, core, halo(i))).collect();
         let (one, others) = bodies.split_at(bodies.len() / 2);
@@ -71,7 +72,6 @@ fn bare_cores_in_any_order_are_the_whole_image() {
         // All samples are dropped, and known all the same.
         let lines = server.post("/v1/images/a/tiles", &bodies[0]).lines();
         assert_eq!(states(&lines), ["repeated", "end"]);
-        use std::os::unix::fs::MetadataExt;
         let kept = std::fs::metadata(server.data_dir().join("images/a/samples")).unwrap();
         assert!(kept.blocks() * 512 <= 8192, "{} bytes of samples are kept", kept.blocks() * 512);
     }
@@ -163,10 +163,10 @@ fn what_cannot_be_is_refused() {
     with(&|o| o["halo"] = json!("client")).problem(400, "bad_parameter");
 }
 
-/// The file that `rpfd filter --partial` would write of these tiles.
-fn partial(size: [u32; 2], tiles: &[SampleTile], method: &Method) -> Vec<u8> {
+/// The file that `rpfd filter --partial` would write of these tiles, if it had samples of some pixels more.
+fn partial(size: [u32; 2], tiles: &[SampleTile], around: &[SampleTile], method: &Method) -> Vec<u8> {
     let mut spool = Spool::in_memory(1 << 26);
-    for tile in tiles {
+    for tile in tiles.iter().chain(around) {
         let (bytes, mut decoder) = (encode(tile), Decoder::new());
         let mut input = &bytes[..];
         while let Some(event) = decoder.next(&mut input).unwrap() {
@@ -212,7 +212,10 @@ fn an_image_is_finished_with_what_there_is() {
     assert!(status["tiles"].as_array().unwrap().iter().any(|tile| tile["report"]["exact"] == false));
     assert!(!status["missing"].as_array().unwrap().is_empty());
     let exr = server.get("/v1/images/a/result.exr");
-    assert!(exr.body == partial(SIZE, &tiles, &Method::preset("lean").unwrap()), "not what filter --partial gives");
+    assert!(
+        exr.body == partial(SIZE, &tiles, &[], &Method::preset("lean").unwrap()),
+        "not what filter --partial gives"
+    );
     // It takes no more, but knows what it has.
     let lines = server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(60, 60, 20, 20), 0)).lines();
     assert_eq!(lines[0]["problem"]["code"], "image_finished");
@@ -229,6 +232,116 @@ fn an_image_is_finished_with_what_there_is() {
     let lines = server.post("/v1/images/b/tiles", &tile([32, 16], Rect::new(16, 0, 16, 16), 0)).lines();
     assert_eq!(lines[0]["problem"]["code"], "image_finished");
     server.post("/v1/images/c/finish", &[]).problem(404, "unknown_image");
+}
+
+/// A tile that brings the halo that its core needs waits for nobody; what it lends counts for others.
+#[test]
+fn halos_stand_for_cores_that_have_not_come() {
+    const SIZE: [u32; 2] = [256, 64];
+    let expected = whole_exr(&samples(SIZE, Rect::new(0, 0, 256, 64), 0, 1), &Method::preset("lean").unwrap(), 5);
+    let server = Server::start(&[]);
+    open(&server, SIZE, "lean");
+    let second = contradicting(SIZE, Rect::new(64, 0, 64, 64), 17);
+    server.post("/v1/images/a/tiles", &encode(&second)).lines();
+    let filtered = |server: &Server, tiles: u64| {
+        wait_for("regions", || server.get("/v1/images/a").json()["tiles_done"] == tiles);
+        server.get("/v1/images/a").json()["waiting"].clone()
+    };
+    let waiting = json!([
+        {"region": [0, 0, 64, 64], "state": "waiting", "for": [[0, 0, 64, 64]], "for_regions": 1},
+        {"region": [64, 0, 64, 64], "state": "filtered", "for": [[47, 0, 17, 64], [128, 0, 17, 64]], "for_regions": 2},
+        {"region": [128, 0, 64, 64], "state": "waiting", "for": [[128, 0, 81, 64]], "for_regions": 1},
+        {"region": [192, 0, 64, 64], "state": "waiting", "for": [[175, 0, 81, 64]], "for_regions": 1},
+    ]);
+    assert_eq!(filtered(&server, 1), waiting);
+    let server = Server::start_in(server.kill(), &[]);
+    assert_eq!(filtered(&server, 1), waiting);
+    // What its neighbour lends, a bare core uses.
+    server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(192, 0, 64, 64), 17)).lines();
+    let waiting = filtered(&server, 2);
+    assert_eq!(waiting[2]["for"], json!([[128, 0, 64, 64]]));
+    server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(128, 0, 64, 64), 0)).lines();
+    // The last of these is final: all that it reads came in cores.
+    wait_for("regions", || server.get("/v1/images/a").json()["regions_open"] == 2);
+    assert_eq!(filtered(&server, 3)[1]["for"], json!([[47, 0, 17, 64]]));
+    // What was lent was not what the cores bring.
+    server.get("/v1/images/a/result.exr").problem(409, "image_incomplete");
+    let server = Server::start_in(server.kill(), &[]);
+    server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(0, 0, 64, 64), 0)).lines();
+    wait_complete(&server, "a");
+    assert!(server.get("/v1/images/a/result.exr").body == expected, "not the image of the cores");
+    assert_eq!(server.get("/v1/images/a").json()["totals"]["short_of_halo"], 0);
+}
+
+/// Bare cores, tiles with some halo or all of it, and some whose halo is not what the cores bring, in any order and
+/// through kills.
+#[test]
+fn any_mixture_is_the_whole_image() {
+    const SIZE: [u32; 2] = [150, 130];
+    let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
+    for (preset, side, seed) in [("lean", 33, 1), ("lean", 64, 2), ("cross-bilateral", 16, 3), ("lean", 75, 4)] {
+        let mut server = Server::start(&["--memory", "64MiB"]);
+        open(&server, SIZE, preset);
+        let mut cores: Vec<Rect> = tiling(SIZE, side).collect();
+        shuffle(&mut cores, seed);
+        let bodies = cores.iter().enumerate().map(|(i, &core)| match i % 4 {
+            0 => tile(SIZE, core, 0),
+            1 => tile(SIZE, core, 5),
+            2 => tile(SIZE, core, 17 + (i as u32 % 3) * 8),
+            _ => encode(&contradicting(SIZE, core, 20)),
+        });
+        let bodies: Vec<Vec<u8>> = bodies.collect();
+        for part in bodies.chunks(bodies.len().div_ceil(3)) {
+            let lines = server.post("/v1/images/a/tiles", &part.concat()).lines();
+            assert!(lines[..part.len()].iter().all(|line| line["state"] == "stored"), "{lines:?}");
+            server = Server::start_in(server.kill(), &["--memory", "64MiB"]);
+        }
+        wait_complete(&server, "a");
+        let exr = server.get("/v1/images/a/result.exr").body;
+        assert!(exr == whole_exr(&whole, &Method::preset(preset).unwrap(), 5), "{preset}, {side}: another image");
+        let kept = std::fs::metadata(server.data_dir().join("images/a/samples")).unwrap();
+        assert!(kept.blocks() * 512 <= 8192, "{} bytes of samples are kept", kept.blocks() * 512);
+    }
+}
+
+#[test]
+fn halos_that_vary_in_their_numbers_of_samples_are_used() {
+    const SIZE: [u32; 2] = [80, 64];
+    let scene = Scene::by_name("all").unwrap();
+    let cut = |core, halo| {
+        let geometry = TileGeometry::with_halo(SIZE, core, halo).unwrap();
+        scene.tile_varying(geometry, 6, &Execution { seed: 1, ..Execution::default() }).unwrap()
+    };
+    let whole = cut(Rect::new(0, 0, SIZE[0], SIZE[1]), 0);
+    let method = Method::preset("lean").unwrap();
+    let server = Server::start(&["--memory", "64MiB"]);
+    server.post("/v1/images", &opening("a", SIZE, "lean", ("max_samples", whole.max_per_pixel())));
+    let mut cores: Vec<Rect> = tiling(SIZE, 24).collect();
+    shuffle(&mut cores, 2);
+    for (i, &core) in cores.iter().enumerate() {
+        server.post("/v1/images/a/tiles", &encode(&cut(core, [0, 6, method.reach(true)][i % 3]))).lines();
+    }
+    wait_complete(&server, "a");
+    assert!(server.get("/v1/images/a/result.exr").body == whole_exr(&whole, &method, 5));
+}
+
+#[test]
+fn an_image_is_finished_with_what_halos_brought() {
+    const SIZE: [u32; 2] = [128, 128];
+    let (core, method) = (Rect::new(32, 40, 64, 50), Method::preset("lean").unwrap());
+    let strips: Vec<SampleTile> =
+        core.grown(5, &Rect::new(0, 0, 128, 128)).without(&core).map(|strip| samples(SIZE, strip, 0, 1)).collect();
+    let server = Server::start(&[]);
+    open(&server, SIZE, "lean");
+    server.post("/v1/images/a/tiles", &tile(SIZE, core, 5)).lines();
+    server.post("/v1/images/a/finish", &[]);
+    wait_for("the regions", || server.get("/v1/images/a").json()["regions_open"] == 0);
+    let status = server.get("/v1/images/a").json();
+    assert_eq!((&status["pixels_done"], &status["pixels_stored"]), (&json!(core.area()), &json!(core.area())));
+    let exr = server.get("/v1/images/a/result.exr").body;
+    let tiles = [samples(SIZE, core, 0, 1)];
+    assert!(exr == partial(SIZE, &tiles, &strips, &method), "the halo was not used");
+    assert!(exr != partial(SIZE, &tiles, &[], &method), "the halo makes no difference");
 }
 
 #[test]

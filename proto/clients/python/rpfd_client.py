@@ -2,7 +2,8 @@
 """A minimal client of tile.md and http.md: writes tiles, sends them, reads results. Needs NumPy and msgpack only.
 
   rpfd_client.py post URL IN.tiles OUT.npy     filter the tiles of a file (URL: http://host:port/v1/filter?preset=NAME)
-  rpfd_client.py images URL IN.tiles OUT.exr   stitch them on the service (URL: http://host:port/v1/images?preset=NAME)
+  rpfd_client.py images URL IN.tiles OUT.exr   stitch them on the service (URL: http://host:port/v1/images?preset=NAME;
+                                               with &halo=neighbors tiles need no halo)
   rpfd_client.py image RESULTS.msgpack OUT.npy stitch results that are in a file
   rpfd_client.py info IN.tiles                 print every header, and each plane's sum
   rpfd_client.py example OUT.tiles             write a small noisy image in four haloed tiles
@@ -13,6 +14,7 @@ first, for which it needs zstandard).
 import json
 import os
 import sys
+import time
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -114,15 +116,30 @@ def progress(results):
         yield message, planes
 
 
+def announced(tiles):
+    """What opens an image of tiles that lend each other their halos: channels and numbers of samples."""
+    most, varying, channels = 1, set(), None
+    for header, counts, _ in tiles:
+        channels = channels or header["channels"]
+        samples = header["samples"] if counts is None else int(counts.max(initial=0))
+        most = max(most, samples)
+        varying.add(samples if counts is None else "varying")
+    return {"channels": channels, "samples" if varying == {most} else "max_samples": most}
+
+
 def stitch_there(url, path, out):
     """Opens an image, sends it the tiles of a file, and fetches the EXR; the image is deleted. False if tiles failed."""
     url, _, query = url.partition("?")
+    parameters = dict(urllib.parse.parse_qsl(query, strict_parsing=bool(query)))
     opener = open
     if path.endswith(".zst"):
         from zstandard import open as opener
     with opener(path, "rb") as file:
         width, height = next(read_tiles(file))[0]["image"]
-    body = {"width": width, "height": height, **dict(urllib.parse.parse_qsl(query, strict_parsing=bool(query)))}
+    body = {"width": width, "height": height, **parameters}
+    if parameters.get("halo") == "neighbors":
+        with opener(path, "rb") as file:
+            body.update(announced(read_tiles(file)))
     image = json.load(call("POST", url, json.dumps(body).encode()))
     image_url, end = f"{url}/{image['id']}", None
     try:
@@ -133,6 +150,13 @@ def stitch_there(url, path, out):
         if end is None or end["state"] != "end":
             raise EOFError("the answer was cut: it has no end")
         if end["errors"] == 0:
+            # Tiles that are stored are filtered later; where some are missing the service says so below.
+            status = json.load(call("GET", image_url))
+            while not status["complete"] and status.get("pixels_stored") == status["pixels"]:
+                if status["trouble"]:
+                    raise SystemExit(json.dumps(status["trouble"]))
+                time.sleep(0.1)
+                status = json.load(call("GET", image_url))
             with open(out, "wb") as file:
                 file.write(call("GET", image_url + "/result.exr").read())
         return end["errors"] == 0

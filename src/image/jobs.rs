@@ -1,0 +1,168 @@
+//! Filters the regions of an image whose tiles lend each other their halos.
+
+use std::{
+    sync::{Arc, atomic::Ordering},
+    time::Instant,
+};
+
+use rayon::ThreadPool;
+
+use super::{After, Claimed, Image, ImageError, neighbors::Neighbors};
+use crate::{
+    filter::{Execution, Rect, TileGeometry, filter},
+    stitch::{Offer, StitchError, Stitcher, window_digest},
+    store::{Change, Records, Source},
+};
+
+/// A region that can be filtered.
+#[derive(Debug)]
+pub struct Job {
+    region: u32,
+    parts: Vec<Part>,
+    /// Whether what it reads does not change any more.
+    last: bool,
+    /// Bytes of memory that this needs at most.
+    pub bytes: u64,
+}
+
+/// What of a region is to be filtered, and the samples for it.
+#[derive(Debug)]
+struct Part {
+    geometry: TileGeometry,
+    sources: Vec<Source>,
+    /// Whether it is on the canvas, filtered from what may have been other samples.
+    again: bool,
+}
+
+/// The parts of a region whose cores have arrived and that are not on the canvas.
+pub(super) fn unfiltered(neighbors: &Neighbors, stitcher: &Stitcher, region: u32) -> Vec<Rect> {
+    let present = neighbors.present(&neighbors.regions().core(region));
+    present.iter().flat_map(|part| stitcher.missing_in(part)).collect()
+}
+
+impl Image {
+    /// The next region that can be filtered, in tiles that take at most `most` bytes each.
+    pub fn next_job(&self, threads: usize, most: u64) -> Result<Option<Job>, ImageError> {
+        self.check()?;
+        let mut inner = self.write();
+        let inner = &mut *inner;
+        let (Some(neighbors), Some(announced)) = (&mut inner.neighbors, &self.description.neighbors) else {
+            return Ok(None);
+        };
+        while let Some(region) = neighbors.start_next() {
+            let last = neighbors.regions().last(region);
+            let mut job = Job { region, parts: Vec::new(), last, bytes: 0 };
+            let mut rects: Vec<_> =
+                unfiltered(neighbors, &inner.stitcher, region).into_iter().map(|rect| (rect, false)).collect();
+            if last {
+                let stored = neighbors.provisional(region).filter(|tile| inner.stitcher.peek(tile).is_some());
+                rects.extend(stored.map(|tile| (tile, true)));
+            }
+            while let Some((core, again)) = rects.pop() {
+                let reach = self.description.method.reach(announced.varying);
+                let geometry =
+                    TileGeometry::with_halo(self.description.size, core, reach).map_err(StitchError::from)?;
+                let window = geometry.window();
+                let sources = neighbors.sources(&window);
+                // Pixels that are not there are pixels without samples.
+                let there = sources.iter().filter_map(|from| from.used.intersection(&window));
+                let varying = announced.varying || there.map(|part| part.area()).sum::<u64>() < window.area();
+                let bytes = announced.cost(&geometry, &self.description.method, threads, varying)
+                    + neighbors.file().cut_bytes(&sources);
+                if bytes <= most {
+                    job.bytes = job.bytes.max(bytes);
+                    job.parts.push(Part { geometry, sources, again });
+                } else if core.area() > 1 && !again {
+                    rects.extend(halves(core).map(|half| (half, false)));
+                } else {
+                    neighbors.give_back(region);
+                    return Err(ImageError::TooLarge { core, needed: bytes, most });
+                }
+            }
+            if !job.parts.is_empty() {
+                neighbors.running += 1;
+                return Ok(Some(job));
+            }
+            // It was filtered when the service ended.
+            neighbors.filtered(region, last);
+        }
+        Ok(None)
+    }
+
+    /// Filters a region, and puts it on the canvas; durable when it returns.
+    pub fn run(self: &Arc<Self>, job: &Job, pool: &ThreadPool) -> Result<(), ImageError> {
+        let done = job.parts.iter().try_for_each(|part| self.filter_part(part, job, pool));
+        let mut inner = self.write();
+        let mut final_ones = Vec::new();
+        if let Some(neighbors) = &mut inner.neighbors {
+            neighbors.running -= 1;
+            if done.is_err() {
+                neighbors.give_back(job.region);
+            } else if job.last {
+                final_ones = neighbors.settle(job.region);
+            }
+        }
+        done?;
+        let changes = final_ones.into_iter().map(|tile| Change::Remove(Records::Provisional, tile));
+        inner.queue(changes, [After::Filtered(job.region, job.last)]);
+        drop(inner);
+        self.flush()
+    }
+
+    /// A region that will not be filtered now.
+    pub fn give_back(&self, job: &Job) {
+        if let Some(neighbors) = &mut self.write().neighbors {
+            neighbors.running -= 1;
+            neighbors.give_back(job.region);
+        }
+    }
+
+    fn filter_part(self: &Arc<Self>, part: &Part, job: &Job, pool: &ThreadPool) -> Result<(), ImageError> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Err(crate::filter::Stopped.into());
+        }
+        let Some(file) = self.read().neighbors.as_ref().map(Neighbors::file) else { return Ok(()) };
+        let (started, core) = (Instant::now(), part.geometry.core());
+        let tile = file.cut(part.geometry, &part.sources)?;
+        // What is filtered for good, and for the first time, is never compared with anything.
+        let digest = if job.last && !part.again { [0; 32] } else { window_digest(&tile) };
+        let claim = {
+            let mut inner = self.write();
+            match inner.stitcher.offer(core, digest, part.again)? {
+                // What halos lent was what the cores brought, or another one was quicker.
+                Offer::Repeated => return Ok(()),
+                Offer::Filter(claim) => {
+                    if !job.last {
+                        // This is known at the latest when the tile is.
+                        inner.queue([Change::Put(Records::Provisional, core, Vec::new())], []);
+                        inner.neighbors.iter_mut().for_each(|neighbors| neighbors.doubt(job.region, core));
+                    }
+                    Claimed { image: Arc::clone(self), claim: Some(claim) }
+                }
+            }
+        };
+        let execution = Execution {
+            seed: self.description.seed,
+            pool: Some(pool),
+            stop: Some(&self.stop),
+            leave_out: self.description.leave_out,
+            ..Execution::default()
+        };
+        let filtered = filter(&tile, &self.description.method, &execution)?;
+        drop(tile);
+        self.add(claim, &filtered, started.elapsed().as_secs_f64())?;
+        Ok(())
+    }
+}
+
+/// A rectangle of more than one pixel in two, across its longer side.
+fn halves(rect: Rect) -> [Rect; 2] {
+    let Rect { x, y, width, height } = rect;
+    if width >= height {
+        let left = width / 2;
+        [Rect::new(x, y, left, height), Rect::new(x + left, y, width - left, height)]
+    } else {
+        let top = height / 2;
+        [Rect::new(x, y, width, top), Rect::new(x, y + top, width, height - top)]
+    }
+}
