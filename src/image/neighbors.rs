@@ -1,11 +1,9 @@
 //! Images whose tiles come as bare cores: the samples are kept until all regions that read them are filtered.
 
 use std::{
-    sync::{Arc, atomic::Ordering},
-    time::Instant,
+    sync::Arc,
+    time::{Duration, Instant},
 };
-
-use rayon::ThreadPool;
 
 use super::{
     After, Announced, Claimed, Description, Image, ImageError, MAX_TILES, MIN_CORE, Outcome, Regions,
@@ -58,6 +56,19 @@ pub struct Job {
     tiles: Vec<(TileGeometry, Vec<(Rect, Extent)>)>,
     /// Bytes of memory that this needs at most.
     pub bytes: u64,
+    /// Pixels of the largest of them.
+    pub pixels: u64,
+}
+
+/// Where the time went in which a region was filtered.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Spent {
+    /// Reading its samples.
+    pub read: Duration,
+    /// Filtering.
+    pub filter: Duration,
+    /// Putting it on the canvas, and waiting until it is durable.
+    pub write: Duration,
 }
 
 impl Announced {
@@ -311,8 +322,9 @@ impl Image {
         Ok(Outcome::Stored)
     }
 
-    /// The next region that can be filtered, in tiles that take at most `most` bytes each.
-    pub fn next_job(&self, threads: usize, most: u64) -> Result<Option<Job>, ImageError> {
+    /// The next region that can be filtered, in tiles that take at most `most` bytes, and have at most so many pixels,
+    /// each.
+    pub fn next_job(&self, threads: usize, most: u64, pixels: u64) -> Result<Option<Job>, ImageError> {
         self.check()?;
         let mut inner = self.write();
         let inner = &mut *inner;
@@ -320,7 +332,7 @@ impl Image {
             return Ok(None);
         };
         while let Some(region) = neighbors.regions.start_next() {
-            let mut job = Job { region, tiles: Vec::new(), bytes: 0 };
+            let mut job = Job { region, tiles: Vec::new(), bytes: 0, pixels: 0 };
             let mut rects = unfiltered(&neighbors.cores, &inner.stitcher, &neighbors.regions.core(region));
             while let Some(core) = rects.pop() {
                 let reach = self.description.method.reach(announced.varying);
@@ -333,10 +345,12 @@ impl Image {
                 let varying = announced.varying || !neighbors.cores.missing(&window).is_empty();
                 let bytes = announced.cost(&geometry, &self.description.method, threads, varying)
                     + neighbors.file.cut_bytes(&cores);
-                if bytes <= most {
+                let single = core.area() == 1;
+                if bytes <= most && (core.area() <= pixels || single) {
                     job.bytes = job.bytes.max(bytes);
+                    job.pixels = job.pixels.max(core.area());
                     job.tiles.push((geometry, cores));
-                } else if core.width > 1 || core.height > 1 {
+                } else if !single {
                     rects.extend(halves(core));
                 } else {
                     neighbors.regions.give_back(region);
@@ -352,9 +366,12 @@ impl Image {
         Ok(None)
     }
 
-    /// Filters a region, and puts it on the canvas; durable when it returns.
-    pub fn run(self: &Arc<Self>, job: &Job, pool: &ThreadPool) -> Result<(), ImageError> {
-        let done = job.tiles.iter().try_for_each(|(geometry, cores)| self.filter_part(geometry, cores, pool));
+    /// Filters a region, and puts it on the canvas; durable when it returns. Parts of it that were done before it was
+    /// stopped are kept. The seed is the image's, whatever the execution says, and so is what is left out.
+    pub fn run(self: &Arc<Self>, job: &Job, execution: &Execution) -> Result<Spent, ImageError> {
+        let mut spent = Spent::default();
+        let mut parts = job.tiles.iter();
+        let done = parts.try_for_each(|(geometry, cores)| self.filter_part(geometry, cores, execution, &mut spent));
         let mut inner = self.write();
         if let Some(neighbors) = &mut inner.neighbors {
             neighbors.running -= 1;
@@ -365,7 +382,10 @@ impl Image {
         done?;
         inner.queue([], Some(After::RegionDone(job.region)));
         drop(inner);
-        self.flush()
+        let started = Instant::now();
+        self.flush()?;
+        spent.write += started.elapsed();
+        Ok(spent)
     }
 
     /// A region that will not be filtered now.
@@ -380,9 +400,10 @@ impl Image {
         self: &Arc<Self>,
         geometry: &TileGeometry,
         cores: &[(Rect, Extent)],
-        pool: &ThreadPool,
+        execution: &Execution,
+        spent: &mut Spent,
     ) -> Result<(), ImageError> {
-        if self.stop.load(Ordering::Relaxed) {
+        if execution.stopped() {
             return Err(crate::filter::Stopped.into());
         }
         let (file, claim) = {
@@ -395,16 +416,15 @@ impl Image {
         };
         let started = Instant::now();
         let tile = file.cut(*geometry, cores)?;
-        let execution = Execution {
-            seed: self.description.seed,
-            pool: Some(pool),
-            stop: Some(&self.stop),
-            leave_out: self.description.leave_out,
-            ..Execution::default()
-        };
-        let filtered = filter(&tile, &self.description.method, &execution)?;
+        spent.read += started.elapsed();
+        let Description { seed, leave_out, .. } = self.description;
+        let began = Instant::now();
+        let filtered = filter(&tile, &self.description.method, &Execution { seed, leave_out, ..*execution })?;
         drop(tile);
+        spent.filter += began.elapsed();
+        let began = Instant::now();
         self.add(claim, &filtered, started.elapsed().as_secs_f64())?;
+        spent.write += began.elapsed();
         Ok(())
     }
 }

@@ -227,7 +227,7 @@ impl Folder for Lossy {
 const SIZE: [u32; 2] = [48, 40];
 
 fn description(method: &Method, neighbors: Option<Announced>) -> Description {
-    Description { size: SIZE, method: method.clone(), seed: 5, leave_out: true, neighbors, disk: 0 }
+    Description { size: SIZE, method: method.clone(), seed: 5, leave_out: true, neighbors, owner: None, disk: 0 }
 }
 
 fn filtered(tile: &SampleTile, method: &Method) -> rpfd::filter::Filtered {
@@ -331,6 +331,7 @@ fn samples_survive_a_power_loss() {
     let cores: Vec<Rect> = tiling(SIZE, 16).collect();
     let tiles: Vec<SampleTile> = cores.iter().map(|&core| samples(SIZE, core, 0, 1)).collect();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let execution = Execution { pool: Some(&pool), ..Execution::default() };
     let mut losses = 0;
     for seed in rounds(40) {
         let mut random = Random::new(seed);
@@ -361,15 +362,15 @@ fn samples_survive_a_power_loss() {
                 if random.below(2) == 0 && image.flush().is_ok() {
                     waiting.drain(..).for_each(|i| acknowledged[i] = true);
                 }
-                while let Ok(Some(job)) = image.next_job(1, u64::MAX) {
-                    if image.run(&job, &pool).is_err() {
+                while let Ok(Some(job)) = image.next_job(1, u64::MAX, u64::MAX) {
+                    if image.run(&job, &execution).is_err() {
                         break;
                     }
                 }
             }
             if image.flush().is_ok() {
-                while let Ok(Some(job)) = image.next_job(1, u64::MAX) {
-                    let _ = image.run(&job, &pool);
+                while let Ok(Some(job)) = image.next_job(1, u64::MAX, u64::MAX) {
+                    let _ = image.run(&job, &execution);
                     if disk.failed() {
                         break;
                     }
