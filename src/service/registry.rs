@@ -235,7 +235,9 @@ impl Images {
 
     /// How many of them are in memory.
     pub(super) fn in_memory(&self) -> usize {
-        self.entries().iter().filter(|entry| matches!(*entry.slot(), Slot::Open(_))).count()
+        // One that is just being opened is as good as open.
+        let open = |entry: &&Arc<Entry>| entry.slot.try_lock().map_or(true, |slot| matches!(*slot, Slot::Open(_)));
+        self.entries().iter().filter(open).count()
     }
 
     pub(super) fn entries(&self) -> Vec<Arc<Entry>> {

@@ -32,8 +32,8 @@ const BUFFER: usize = 64 << 10;
 const ROOM: u64 = 64 << 10;
 /// Bytes that are read before their place on the disk is given back.
 const HOLE: u64 = 1 << 20;
-/// More than a result has beside its pixels.
-const AROUND: u64 = 64 << 10;
+/// More than a result has beside its pixels, and than is said of a tile without them.
+pub(super) const AROUND: u64 = 64 << 10;
 
 /// How far the file has been written.
 #[derive(Clone, Copy, Debug, Default)]

@@ -33,7 +33,7 @@ use super::{
     query::{Form, Parameters, attributes},
     receive::{Fault, Received, Receiver},
     registry::{Id, Opened},
-    results::{Results, file_response},
+    results::{AROUND, Results, file_response},
     work::{blocking, stopped},
 };
 use crate::{
@@ -96,6 +96,14 @@ impl Call {
         match &self.target {
             Target::Client => Ok(()),
             Target::Image { image, .. } => image.check(header),
+        }
+    }
+
+    /// Bytes of disk that what is said of a tile takes at most, until it is read.
+    pub(super) fn result_bytes(&self, core: Rect) -> u64 {
+        match &self.target {
+            Target::Client => Results::bytes(core),
+            Target::Image { .. } => AROUND,
         }
     }
 

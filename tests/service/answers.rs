@@ -59,8 +59,7 @@ fn what_nobody_reads_is_reserved_and_beyond_the_limit_refused() {
     wait_for("the room to be free", || server.metric(UNREAD) == Some(0.0));
     assert_eq!(server.get(exr).status, 200);
     wait_for("the room to be free", || server.metric(UNREAD) == Some(0.0));
-    // No more than a tile needs, though what it needs is not used.
-    let few = Server::start(&["--unread-results", "8MiB"]);
+    let few = Server::start(&["--unread-results", "1MiB"]);
     half(&few, SIZE);
     few.get(exr).problem(507, "results_unread");
     assert_eq!(few.get("/v1/images/a").status, 200);

@@ -52,7 +52,9 @@ fn it_answers_while_it_recovers() {
     server.get("/v1/nothing").problem(404, "not_found");
     // All goes on once the log is read.
     let log = BufReader::new(server.child.stderr.take().unwrap());
-    let log = std::thread::spawn(move || log.lines().filter(|line| line.as_ref().unwrap().contains("broken-")).count());
+    let log = std::thread::spawn(move || {
+        log.lines().filter(|line| line.as_ref().unwrap().contains("cannot be opened")).count()
+    });
     wait_for("the images to be recovered", || server.get("/readyz").status == 200);
     assert_eq!(server.metric("rpfd_ready"), Some(1.0));
     assert_eq!(server.get("/v1/images").json()["images"].as_array().unwrap().len(), IMAGES);
