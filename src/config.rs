@@ -141,6 +141,9 @@ settings! {
     /// Images open at once. 1 to 65536
     images: usize = 1024, "N", count, "must be 1 to 65536";
 
+    /// Images open at once that were opened with one token, unless the token file says otherwise. 1 to 65536
+    token_images: usize = 256, "N", count, "must be 1 to 65536";
+
     /// Disk for all images; what one takes at worst is set aside when it is opened. 1MiB to 1EiB
     disk: ByteSize = ByteSize(64 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_DISK).contains(&size.0),
         "must be 1MiB to 1EiB";
@@ -149,13 +152,16 @@ settings! {
     image_ttl: Duration = Duration::from_secs(7 * 86_400), "TIME",
         |time| (Duration::from_secs(1)..=MAX_TTL).contains(time), "must be a second to ten years";
 
+    /// How long an image that nobody uses stays in memory, and its files open. Up to a day
+    image_idle: Duration = Duration::from_secs(30), "TIME", deadline, "must be more than 0 and a day at most";
+
     /// Pixels of an image, at most; its canvas takes 12 bytes of disk for each. 1 to 2^40
     image_pixels: u64 = 1 << 30, "N", |n| (1..=MAX_IMAGE_PIXELS).contains(n), "must be 1 to 2^40";
 
-    /// Requests that may wait for memory at once; more are refused. 1 to 65536
+    /// Requests and tiles that may wait for memory at once; more are refused. 1 to 65536
     queue: usize = 1024, "N", count, "must be 1 to 65536";
 
-    /// Disk for results that nobody has read yet, of all requests. 1MiB to 4TiB less 1KiB
+    /// Disk for results and other answers that nobody has read yet, of all requests. 1MiB to 4TiB less 1KiB
     unread_results: ByteSize = ByteSize(4 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_MEMORY).contains(&size.0),
         "must be 1MiB to 4TiB less 1KiB";
 
@@ -172,7 +178,7 @@ settings! {
     /// nothing of the answer
     idle_deadline: Duration = Duration::from_secs(30), "TIME", deadline, "must be more than 0 and a day at most";
 
-    /// How long filtering one tile may take
+    /// How long filtering one tile may take, or one region of bare cores, which is then filtered in smaller parts
     work_deadline: Duration = Duration::from_secs(3600), "TIME", deadline, "must be more than 0 and a day at most";
 
     /// How long requests may go on after the service was told to stop
@@ -249,8 +255,10 @@ mod tests {
             requests: 0,
             token_requests: 0,
             images: 0,
+            token_images: 0,
             disk: ByteSize(0),
             image_ttl: Duration::ZERO,
+            image_idle: Duration::ZERO,
             image_pixels: 0,
             log: "a=b=c".to_owned(),
             metrics_listen: None,
@@ -289,6 +297,7 @@ mod tests {
         assert!(with(&|c| c.min_rate.0 = 1 << 30) && !with(&|c| c.min_rate.0 = (1 << 30) + 1));
         assert!(with(&|c| c.unread_results.0 = MIN_MEMORY) && !with(&|c| c.unread_results.0 = MIN_MEMORY - 1));
         assert!(with(&|c| c.images = 1) && !with(&|c| c.images = MAX_COUNT + 1));
+        assert!(with(&|c| c.token_images = 1) && !with(&|c| c.token_images = MAX_COUNT + 1));
     }
 
     #[test]

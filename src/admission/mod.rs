@@ -80,6 +80,8 @@ struct Waiter {
     bytes: u64,
     /// Bytes by which others may still pass it.
     patience: u64,
+    /// Whether it takes one of the places.
+    counts: bool,
     granted: oneshot::Sender<Permit>,
 }
 
@@ -129,7 +131,7 @@ impl Drop for Place {
 }
 
 impl Budget {
-    /// A budget of so many bytes, for which so many requests may wait at once.
+    /// A budget of so many bytes, for which so many may wait at once, [`reserve_own`](Self::reserve_own) aside.
     pub fn new(bytes: u64, places: usize) -> Self {
         let state = State { free: bytes, queue: VecDeque::new(), next: 0, drain: Drain::default() };
         Self { shared: Arc::new(Shared { total: bytes, places, state: Mutex::new(state) }) }
@@ -145,9 +147,14 @@ impl Budget {
         self.shared.lock().free
     }
 
-    /// Requests that wait.
+    /// How many wait.
     pub fn waiting(&self) -> usize {
         self.shared.lock().queue.len()
+    }
+
+    /// A permit of nothing, to [grow](Permit::grow_to).
+    pub fn none(&self) -> Permit {
+        Permit { budget: self.clone(), bytes: 0 }
     }
 
     /// Says whether so many bytes can ever be reserved.
@@ -188,6 +195,22 @@ impl Budget {
         own: impl Future<Output = ()>,
         deadline: Duration,
     ) -> Result<Permit, AdmissionError> {
+        self.wait(true, bytes, own, deadline).await
+    }
+
+    /// As [`reserve`](Self::reserve), for work that is nobody's request: it takes no place of one in the queue, is never
+    /// refused for want of one, and waits for its turn however long that is.
+    pub async fn reserve_own(&self, bytes: u64) -> Result<Permit, AdmissionError> {
+        self.wait(false, bytes, std::future::pending(), Duration::MAX).await
+    }
+
+    async fn wait(
+        &self,
+        counts: bool,
+        bytes: u64,
+        own: impl Future<Output = ()>,
+        deadline: Duration,
+    ) -> Result<Permit, AdmissionError> {
         self.check(bytes)?;
         let busy = |waited, wait: Option<Duration>| {
             // Nothing was given back yet: who waited in vain for so long may as well wait that long again.
@@ -195,12 +218,13 @@ impl Budget {
         };
         let (granted, grant) = oneshot::channel();
         let queued = self.change(|state| {
-            if state.queue.len() >= self.shared.places && state.free < bytes {
+            let waiting = || state.queue.iter().filter(|waiter| waiter.counts).count();
+            if counts && state.free < bytes && waiting() >= self.shared.places {
                 return Err(state.wait(bytes, self.shared.total));
             }
             state.next += 1;
             let id = state.next;
-            state.queue.push_back(Waiter { id, bytes, patience: bytes, granted });
+            state.queue.push_back(Waiter { id, bytes, patience: bytes, counts, granted });
             Ok(id)
         });
         let _place = match queued {
@@ -408,6 +432,35 @@ mod tests {
             assert!(matches!(refused, AdmissionError::Busy { waited: Duration::ZERO, .. }), "{refused:?}");
             drop(held);
             assert_eq!(waiting.await.unwrap().bytes(), 1);
+        });
+    }
+
+    #[test]
+    fn own_work_waits_its_turn_and_takes_no_place() {
+        run(async {
+            let budget = Budget::new(10, 1);
+            let held = budget.reserve(10, SOON).await.unwrap();
+            let own = |bytes| {
+                let budget = budget.clone();
+                tokio::spawn(async move { budget.reserve_own(bytes).await })
+            };
+            let first = [own(6), own(6), own(6)];
+            yield_now().await;
+            // There is a place for a request, and one only; own work is let in all the same.
+            let request = ask(&budget, 6).await;
+            assert_eq!(budget.reserve(6, LATER).await.unwrap_err().code(), "busy");
+            let last = own(6);
+            yield_now().await;
+            assert_eq!(budget.waiting(), 5);
+            drop(held);
+            // In the order of coming.
+            for own in first {
+                assert_eq!((own.await.unwrap().unwrap().bytes(), last.is_finished()), (6, false));
+            }
+            assert_eq!((request.await.unwrap().bytes(), last.is_finished()), (6, false));
+            assert_eq!(last.await.unwrap().unwrap().bytes(), 6);
+            assert_eq!((budget.free(), budget.waiting()), (10, 0));
+            assert_eq!(budget.reserve_own(11).await.unwrap_err().code(), "over_memory");
         });
     }
 }

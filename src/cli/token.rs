@@ -26,6 +26,9 @@ pub(crate) struct Args {
     /// Requests at once with it; as the service's token_requests says by default
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
     requests: Option<u32>,
+    /// Images open at once that were opened with it; as the service's token_images says by default
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    images: Option<u32>,
     /// File for the token; if it is there, the token in it is used
     #[arg(long, value_name = "FILE")]
     secret: Option<PathBuf>,
@@ -49,8 +52,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let mut roles = args.roles.clone();
     roles.dedup();
-    let requests = args.requests.map_or_else(String::new, |n| format!("requests = {n}\n"));
-    say!("[[token]]\nname = {:?}\nroles = {roles:?}\nhash = {:?}\n{requests}", args.name, hash_token(&token));
+    let limit = |key: &str, limit: Option<u32>| limit.map_or_else(String::new, |n| format!("{key} = {n}\n"));
+    let limits = limit("requests", args.requests) + &limit("images", args.images);
+    say!("[[token]]\nname = {:?}\nroles = {roles:?}\nhash = {:?}\n{limits}", args.name, hash_token(&token));
     Ok(())
 }
 

@@ -21,6 +21,8 @@ pub struct Description {
     pub leave_out: bool,
     /// What is announced of its tiles, if they come as bare cores that lend each other their halos.
     pub neighbors: Option<Announced>,
+    /// Whose it is, among those who share a service.
+    pub owner: Option<String>,
     /// Bytes of disk that it may take.
     pub disk: u64,
 }
@@ -39,7 +41,8 @@ pub struct Announced {
 }
 
 impl Description {
-    /// Whether another one asks for the same image. How large its regions are, and what it takes, is the service's.
+    /// Whether another one asks for the same image. How large its regions are, what it takes, and whose it is, is the
+    /// service's.
     pub fn same(&self, other: &Self) -> bool {
         let announced = |of: &Self| of.neighbors.clone().map(|known| Announced { region: 0, ..known });
         self.size == other.size
@@ -57,7 +60,8 @@ impl Description {
         });
         json!({
             "version": 1, "size": self.size, "preset": self.method.preset_name(), "parameters": parameters,
-            "seed": self.seed, "leave_out": self.leave_out, "neighbors": neighbors, "disk": self.disk,
+            "seed": self.seed, "leave_out": self.leave_out, "neighbors": neighbors, "owner": self.owner,
+            "disk": self.disk,
         })
         .to_string()
         .into_bytes()
@@ -94,6 +98,7 @@ impl Description {
             seed: value["seed"].as_u64()?,
             leave_out: value["leave_out"].as_bool()?,
             neighbors,
+            owner: value["owner"].as_str().map(ToOwned::to_owned),
             disk: value["disk"].as_u64()?,
         })
     }
@@ -232,9 +237,20 @@ mod tests {
     #[test]
     fn a_description_is_read_as_it_was_written() {
         let method = Method::with("lean", [("boxes", "9,5"), ("spikes", "off")]).unwrap();
-        let bare = Description { size: [3, 4], method, seed: u64::MAX, leave_out: false, neighbors: None, disk: 7 };
+        let bare = Description {
+            size: [3, 4],
+            method,
+            seed: u64::MAX,
+            leave_out: false,
+            neighbors: None,
+            owner: None,
+            disk: 7,
+        };
         assert_eq!(Description::decode(&bare.encode()), Some(bare.clone()));
         let known = Announced { channels: channels(), samples: 8, varying: true, region: 64 };
+        let owned = Description { owner: Some("farm".to_owned()), ..bare.clone() };
+        assert_eq!(Description::decode(&owned.encode()), Some(owned.clone()));
+        assert!(owned.same(&bare));
         let with = Description { neighbors: Some(known.clone()), ..bare.clone() };
         assert_eq!(Description::decode(&with.encode()), Some(with.clone()));
         assert!(!bare.same(&with));

@@ -1,13 +1,11 @@
 //! Filters the regions of an image whose tiles lend each other their halos.
 
 use std::{
-    sync::{Arc, atomic::Ordering},
-    time::Instant,
+    sync::Arc,
+    time::{Duration, Instant},
 };
 
-use rayon::ThreadPool;
-
-use super::{After, Claimed, Image, ImageError, neighbors::Neighbors};
+use super::{After, Claimed, Description, Image, ImageError, neighbors::Neighbors};
 use crate::{
     filter::{Execution, Rect, TileGeometry, filter},
     stitch::{Offer, StitchError, Stitcher, window_digest},
@@ -23,6 +21,19 @@ pub struct Job {
     last: bool,
     /// Bytes of memory that this needs at most.
     pub bytes: u64,
+    /// Pixels of the largest part.
+    pub pixels: u64,
+}
+
+/// Where the time went in which a region was filtered.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Spent {
+    /// Reading its samples.
+    pub read: Duration,
+    /// Filtering.
+    pub filter: Duration,
+    /// Putting it on the canvas, and waiting until it is durable.
+    pub write: Duration,
 }
 
 /// What of a region is to be filtered, and the samples for it.
@@ -41,8 +52,9 @@ pub(super) fn unfiltered(neighbors: &Neighbors, stitcher: &Stitcher, region: u32
 }
 
 impl Image {
-    /// The next region that can be filtered, in tiles that take at most `most` bytes each.
-    pub fn next_job(&self, threads: usize, most: u64) -> Result<Option<Job>, ImageError> {
+    /// The next region that can be filtered, in tiles that take at most `most` bytes, and have at most so many pixels,
+    /// each; but those that are filtered again are what they were.
+    pub fn next_job(&self, threads: usize, most: u64, pixels: u64) -> Result<Option<Job>, ImageError> {
         self.check()?;
         let mut inner = self.write();
         let inner = &mut *inner;
@@ -51,7 +63,7 @@ impl Image {
         };
         while let Some(region) = neighbors.start_next() {
             let last = neighbors.regions().last(region);
-            let mut job = Job { region, parts: Vec::new(), last, bytes: 0 };
+            let mut job = Job { region, parts: Vec::new(), last, bytes: 0, pixels: 0 };
             let mut rects: Vec<_> =
                 unfiltered(neighbors, &inner.stitcher, region).into_iter().map(|rect| (rect, false)).collect();
             if last {
@@ -69,10 +81,12 @@ impl Image {
                 let varying = announced.varying || there.map(|part| part.area()).sum::<u64>() < window.area();
                 let bytes = announced.cost(&geometry, &self.description.method, threads, varying)
                     + neighbors.file().cut_bytes(&sources);
-                if bytes <= most {
+                let whole = again || core.area() == 1;
+                if bytes <= most && (core.area() <= pixels || whole) {
                     job.bytes = job.bytes.max(bytes);
+                    job.pixels = job.pixels.max(core.area());
                     job.parts.push(Part { geometry, sources, again });
-                } else if core.area() > 1 && !again {
+                } else if !whole {
                     rects.extend(halves(core).map(|half| (half, false)));
                 } else {
                     neighbors.give_back(region);
@@ -89,9 +103,11 @@ impl Image {
         Ok(None)
     }
 
-    /// Filters a region, and puts it on the canvas; durable when it returns.
-    pub fn run(self: &Arc<Self>, job: &Job, pool: &ThreadPool) -> Result<(), ImageError> {
-        let done = job.parts.iter().try_for_each(|part| self.filter_part(part, job, pool));
+    /// Filters a region, and puts it on the canvas; durable when it returns. Parts of it that were done before it was
+    /// stopped are kept. The seed is the image's, whatever the execution says, and so is what is left out.
+    pub fn run(self: &Arc<Self>, job: &Job, execution: &Execution) -> Result<Spent, ImageError> {
+        let mut spent = Spent::default();
+        let done = job.parts.iter().try_for_each(|part| self.filter_part(part, job, execution, &mut spent));
         let mut inner = self.write();
         let mut final_ones = Vec::new();
         if let Some(neighbors) = &mut inner.neighbors {
@@ -106,7 +122,10 @@ impl Image {
         let changes = final_ones.into_iter().map(|tile| Change::Remove(Records::Provisional, tile));
         inner.queue(changes, [After::Filtered(job.region, job.last)]);
         drop(inner);
-        self.flush()
+        let began = Instant::now();
+        self.flush()?;
+        spent.write += began.elapsed();
+        Ok(spent)
     }
 
     /// A region that will not be filtered now.
@@ -117,13 +136,20 @@ impl Image {
         }
     }
 
-    fn filter_part(self: &Arc<Self>, part: &Part, job: &Job, pool: &ThreadPool) -> Result<(), ImageError> {
-        if self.stop.load(Ordering::Relaxed) {
+    fn filter_part(
+        self: &Arc<Self>,
+        part: &Part,
+        job: &Job,
+        execution: &Execution,
+        spent: &mut Spent,
+    ) -> Result<(), ImageError> {
+        if execution.stopped() {
             return Err(crate::filter::Stopped.into());
         }
         let Some(file) = self.read().neighbors.as_ref().map(Neighbors::file) else { return Ok(()) };
         let (started, core) = (Instant::now(), part.geometry.core());
         let tile = file.cut(part.geometry, &part.sources)?;
+        spent.read += started.elapsed();
         // What is filtered for good, and for the first time, is never compared with anything.
         let digest = if job.last && !part.again { [0; 32] } else { window_digest(&tile) };
         let claim = {
@@ -141,16 +167,14 @@ impl Image {
                 }
             }
         };
-        let execution = Execution {
-            seed: self.description.seed,
-            pool: Some(pool),
-            stop: Some(&self.stop),
-            leave_out: self.description.leave_out,
-            ..Execution::default()
-        };
-        let filtered = filter(&tile, &self.description.method, &execution)?;
+        let Description { seed, leave_out, .. } = self.description;
+        let began = Instant::now();
+        let filtered = filter(&tile, &self.description.method, &Execution { seed, leave_out, ..*execution })?;
         drop(tile);
+        spent.filter += began.elapsed();
+        let began = Instant::now();
         self.add(claim, &filtered, started.elapsed().as_secs_f64())?;
+        spent.write += began.elapsed();
         Ok(())
     }
 }

@@ -22,7 +22,7 @@ pub mod regions;
 pub use announced::keeping;
 pub use description::{Announced, Description, disk_bytes};
 pub use error::ImageError;
-pub use jobs::Job;
+pub use jobs::{Job, Spent};
 pub use regions::{RegionState, Regions};
 
 use std::{
@@ -109,7 +109,6 @@ pub struct Image {
     failed: OnceLock<StateError>,
     /// Held, many at a time, by those who write pixels or samples; taken before the other locks.
     writing: RwLock<()>,
-    stop: AtomicBool,
 }
 
 #[derive(Debug)]
@@ -227,7 +226,6 @@ impl Image {
             inner: RwLock::new(inner),
             failed: OnceLock::new(),
             writing: RwLock::new(()),
-            stop: AtomicBool::new(false),
         })
     }
 
@@ -268,16 +266,6 @@ impl Image {
         let writer = self.writing.read().unwrap_or_else(PoisonError::into_inner);
         self.check()?;
         Ok(writer)
-    }
-
-    /// Stops the work on it: it is being forgotten, or the service ends.
-    pub fn stop(&self) {
-        self.stop.store(true, Ordering::Relaxed);
-    }
-
-    /// What the work on it looks at.
-    pub const fn stopping(&self) -> &AtomicBool {
-        &self.stop
     }
 
     /// Asks whether a tile is wanted, and keeps its samples if they are to be filtered later. What it says, but for
@@ -472,6 +460,11 @@ impl Image {
         let inner = self.read();
         let known = inner.result.as_deref() == Some(&key(options));
         known.then(|| File::open(self.folder().join(RESULT)).ok()).flatten()
+    }
+
+    /// Removes the result that was written down, if there is one.
+    pub fn forget_result(&self) {
+        self.write().forget_result(&*self.folder);
     }
 
     /// Keeps a file as the result with these options, until the image changes or another one is kept. It was written in

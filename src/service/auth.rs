@@ -1,4 +1,4 @@
-//! Who may do what: bearer tokens from a file, and how many requests each may have under way.
+//! Who may do what: bearer tokens from a file, how many requests each may have under way, and how many images open.
 //!
 //! The file holds BLAKE3 hashes: whoever reads it cannot use the service. A token of [`MIN_TOKEN`] random characters
 //! cannot be guessed, so that its hash needs neither salt nor slowness.
@@ -71,7 +71,18 @@ struct Token {
     roles: Vec<Role>,
     /// Requests that it may have under way; none: as many as the configuration says.
     limit: Option<usize>,
+    /// Images that it may have open; none: as many as the configuration says.
+    images: Option<usize>,
     in_flight: Arc<AtomicUsize>,
+}
+
+/// Whose a request is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Owner {
+    /// The token's name.
+    pub(super) name: Arc<str>,
+    /// Images that it may have open.
+    pub(super) images: usize,
 }
 
 /// Checks a token, and says what would be right.
@@ -154,7 +165,7 @@ fn parse(text: &str) -> Result<Vec<Token>, Vec<(usize, String)>> {
 
 /// One entry.
 fn one(entry: &DeTable) -> Result<Token, Vec<String>> {
-    let (mut name, mut hash, mut roles, mut limit, mut wrong) = (None, None, None, None, Vec::new());
+    let (mut name, mut hash, mut roles, mut limit, mut images, mut wrong) = (None, None, None, None, None, Vec::new());
     for (key, value) in entry {
         let value = value.get_ref();
         let mut set = |result: Result<(), String>| wrong.extend(result.err());
@@ -170,19 +181,20 @@ fn one(entry: &DeTable) -> Result<Token, Vec<String>> {
                 Ok(())
             })),
             "roles" => set(read_roles(value).map(|read| roles = Some(read))),
-            "requests" => {
+            key @ ("requests" | "images") => {
                 let read = value.as_integer().and_then(|n| usize::from_str_radix(n.as_str(), n.radix()).ok());
-                limit = read.filter(|n| (1..=MAX_COUNT).contains(n));
-                set(limit.map(drop).ok_or_else(|| format!("requests must be 1 to {MAX_COUNT}")));
+                let read = read.filter(|n| (1..=MAX_COUNT).contains(n));
+                *(if key == "images" { &mut images } else { &mut limit }) = read;
+                set(read.map(drop).ok_or_else(|| format!("{key} must be 1 to {MAX_COUNT}")));
             }
             // Never the value: it may be the token itself.
-            other => set(Err(format!("there is no key {other:?}: known are name, roles, hash, requests"))),
+            other => set(Err(format!("there is no key {other:?}: known are name, roles, hash, requests, images"))),
         }
     }
     let missing = [("name", name.is_none()), ("hash", hash.is_none()), ("roles", roles.is_none())];
     match (name, hash, roles) {
         (Some(name), Some(hash), Some(roles)) if wrong.is_empty() => {
-            Ok(Token { name, hash, roles, limit, in_flight: Arc::default() })
+            Ok(Token { name, hash, roles, limit, images, in_flight: Arc::default() })
         }
         _ => {
             let given = |key: &str| entry.keys().any(|k| k.get_ref() == key);
@@ -218,6 +230,7 @@ pub(super) struct Auth {
     in_flight: Arc<AtomicUsize>,
     limit: usize,
     token_limit: usize,
+    token_images: usize,
 }
 
 /// A request that may go on; dropping it makes room for another.
@@ -254,8 +267,8 @@ impl Auth {
     pub(super) fn new(config: &Config) -> Result<Self, TokensError> {
         let path = config.token_file.clone();
         let tokens = RwLock::new(path.as_deref().map(read).transpose()?.unwrap_or_default());
-        let (limit, token_limit) = (config.requests, config.token_requests);
-        Ok(Self { path, tokens, in_flight: Arc::default(), limit, token_limit })
+        let (limit, token_limit, token_images) = (config.requests, config.token_requests, config.token_images);
+        Ok(Self { path, tokens, in_flight: Arc::default(), limit, token_limit, token_images })
     }
 
     /// Reads the file again; requests that were let in go on. If it is wrong all stays as it was. Blocks.
@@ -273,7 +286,7 @@ impl Auth {
     }
 
     /// Lets a request in, or says why not; and whose it is.
-    fn check(&self, method: &Method, path: &str, headers: &HeaderMap) -> Result<(Pass, Option<Arc<str>>), Refusal> {
+    fn check(&self, method: &Method, path: &str, headers: &HeaderMap) -> Result<(Pass, Option<Owner>), Refusal> {
         let mut pass = Pass { counters: Vec::with_capacity(2) };
         if OPEN.contains(&path) {
             return Ok((pass, None));
@@ -309,7 +322,7 @@ impl Auth {
                 ));
             }
             pass.enter(&token.in_flight, token.limit.unwrap_or(self.token_limit), "with this token")?;
-            whose = Some(Arc::clone(&token.name));
+            whose = Some(Owner { name: Arc::clone(&token.name), images: token.images.unwrap_or(self.token_images) });
         }
         pass.enter(&self.in_flight, self.limit, "in all")?;
         Ok((pass, whose))
@@ -332,8 +345,15 @@ fn bearer(headers: &HeaderMap) -> Result<&str, Refusal> {
 }
 
 /// Lets requests in; the pass goes along with the answer until all of it is sent.
-pub(super) async fn admit(State(service): State<Shared>, request: Request, next: Next) -> Result<Response, Refusal> {
-    let (pass, _) = service.auth.check(request.method(), request.uri().path(), request.headers())?;
+pub(super) async fn admit(
+    State(service): State<Shared>,
+    mut request: Request,
+    next: Next,
+) -> Result<Response, Refusal> {
+    let (pass, whose) = service.auth.check(request.method(), request.uri().path(), request.headers())?;
+    if let Some(owner) = whose {
+        request.extensions_mut().insert(owner);
+    }
     let mut response = next.run(request).await;
     response.extensions_mut().insert(Arc::new(pass));
     Ok(response)
@@ -370,7 +390,7 @@ mod tests {
             path,
             &headers(authorization),
         ) {
-            Ok((_, whose)) => whose.map_or("open".to_owned(), |name| name.to_string()),
+            Ok((_, whose)) => whose.map_or("open".to_owned(), |owner| owner.name.to_string()),
             Err(refusal) => refusal.0.code,
         };
         let (a, b) = (format!("Bearer {TOKEN}"), format!("bearer  {other}"));
@@ -407,7 +427,7 @@ mod tests {
     #[test]
     fn a_bad_file_says_all_that_is_wrong_and_no_secret() {
         let text = format!(
-            "{}{}[[token]]\nname = \"a b\"\nroles = [\"write\"]\nhash = \"{TOKEN}\"\ntoken = \"{TOKEN}\"\nrequests = 0\n[[token]]\n\n[other]\n",
+            "{}{}[[token]]\nname = \"a b\"\nroles = [\"write\"]\nhash = \"{TOKEN}\"\ntoken = \"{TOKEN}\"\nrequests = 0\nimages = 65537\n[[token]]\n\n[other]\n",
             entry("a", TOKEN, "roles = [\"read\"]"),
             entry("a", TOKEN, "roles = [\"read\"]"),
         );
@@ -415,10 +435,10 @@ mod tests {
         let has = |line: usize, said: &str| wrong.iter().any(|(at, what)| *at == line && what.contains(said));
         assert!(has(5, "two tokens") && has(9, "1 to 64") && has(9, "submit") && has(9, "64 hex"), "{wrong:?}");
         assert!(
-            has(9, "\"token\"") && has(9, "requests must") && has(15, "needs name") && has(15, "needs hash"),
+            has(9, "\"token\"") && has(9, "requests must") && has(16, "needs name") && has(16, "needs hash"),
             "{wrong:?}"
         );
-        assert!(has(17, "[[token]]") && wrong.len() == 10, "{wrong:?}");
+        assert!(has(9, "images must") && has(18, "[[token]]") && wrong.len() == 11, "{wrong:?}");
         assert!(!format!("{wrong:?}").contains(TOKEN));
         assert!(parse("").unwrap_err()[0].1.contains("no [[token]]"));
         assert_eq!(parse("x = \ny = \n").unwrap_err().len(), 2);
@@ -440,7 +460,10 @@ mod tests {
         assert_eq!(auth.reload(), Ok(1));
         assert_eq!(ask().unwrap_err(), "too_many_requests");
         drop(held);
-        assert_eq!(ask().unwrap().1.as_deref(), Some("renamed"));
+        let images = Config::default().token_images;
+        assert_eq!(ask().unwrap().1, Some(Owner { name: "renamed".into(), images }));
+        write(&entry("renamed", TOKEN, "roles = [\"read\"]\nimages = 3"));
+        assert_eq!((auth.reload(), ask().unwrap().1.map(|owner| owner.images)), (Ok(1), Some(3)));
         write(&entry("b", &TOKEN.replace('0', "x"), "roles = [\"read\"]"));
         assert_eq!(auth.reload(), Ok(1));
         assert_eq!(ask().unwrap_err(), "unknown_token");

@@ -38,6 +38,8 @@ pub(super) struct Frames {
     charge: Charge,
     pace: Pace,
     meter: Meter,
+    /// Whether something of it was handed on.
+    begun: bool,
     ended: bool,
 }
 
@@ -52,7 +54,7 @@ impl Frames {
             .filter(|name| !name.is_empty() && name != "identity");
         let inflate = match (encodings.next().as_deref(), encodings.next()) {
             (None, _) => None,
-            (Some("zstd"), None) => Some(Inflate::zstd()?),
+            (Some("zstd"), None) => Some(Inflate::zstd()),
             (Some("gzip" | "x-gzip"), None) => {
                 charge.add_window(0)?;
                 Some(Inflate::gzip())
@@ -67,7 +69,7 @@ impl Frames {
             }
         };
         let (source, meter) = (body.into_data_stream(), Meter::new(pace));
-        Ok(Self { source, inflate, packed: Bytes::new(), charge, pace, meter, ended: false })
+        Ok(Self { source, inflate, packed: Bytes::new(), charge, pace, meter, begun: false, ended: false })
     }
 
     /// The next bytes, never none; `Ok(None)` at the end of the body. Between tiles nothing need come for a while;
@@ -80,8 +82,13 @@ impl Frames {
                 Some(inflate) => inflate.next(&mut self.packed),
             };
             match inflated.map_err(|error| self.fault(&error))? {
-                Some(Inflated::Bytes(bytes)) if !bytes.is_empty() => return Ok(Some(bytes)),
-                Some(Inflated::Window(window)) => self.charge.add_window(window)?,
+                Some(Inflated::Bytes(bytes)) if !bytes.is_empty() => {
+                    self.begun = true;
+                    return Ok(Some(bytes));
+                }
+                // From then on the request may hold memory for a tile.
+                Some(Inflated::Window(window)) if self.begun => self.charge.add_window(window)?,
+                Some(Inflated::Window(window)) => self.charge.wait_window(window).await?,
                 _ if self.ended => return Ok(None),
                 _ => self.read(between).await?,
             }
@@ -213,8 +220,8 @@ mod tests {
         let mut headers = HeaderMap::new();
         encoding.map(|encoding| headers.insert(header::CONTENT_ENCODING, encoding.parse().unwrap()));
         runtime.block_on(async {
-            let permit = Budget::new(memory, 1).reserve(REQUEST, PACE.idle).await.unwrap();
-            let frames = Frames::new(&headers, body, Charge::new(permit), pace);
+            let charge = Charge::new(&Budget::new(memory, 1), REQUEST, PACE.idle).await.unwrap();
+            let frames = Frames::new(&headers, body, charge, pace);
             let code = |refusal: Refusal| refusal.0.code;
             frames.map_err(code)?.all(100_000).await.map_err(code)
         })
@@ -266,6 +273,36 @@ mod tests {
         let two = |log| [packed(20), packed(log)].concat();
         assert_eq!(read(Some("zstd"), two(23).into(), memory, PACE), Ok(b"smallsmall".to_vec()));
         assert_eq!(read(Some("zstd"), two(23).into(), memory - 1, PACE).unwrap_err(), "over_memory");
+    }
+
+    #[test]
+    fn a_wide_window_waits_for_its_turn_and_holds_nothing() {
+        let total = REQUEST + OVERHEAD + (8 << 20);
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
+        let headers = [(header::CONTENT_ENCODING, "zstd".parse().unwrap())].into_iter().collect();
+        runtime.block_on(async {
+            let budget = Budget::new(total, 2);
+            let other = budget.reserve(4 << 20, PACE.idle).await.unwrap();
+            let read = |body: Vec<u8>, deadline| {
+                let (budget, headers) = (budget.clone(), HeaderMap::clone(&headers));
+                tokio::spawn(async move {
+                    let charge = Charge::new(&budget, REQUEST, deadline).await.unwrap();
+                    Frames::new(&headers, body.into(), charge, PACE).unwrap().all(1000).await.map_err(|r| r.0.code)
+                })
+            };
+            let waits = read(packed(23), Duration::from_secs(600));
+            while budget.waiting() == 0 {
+                tokio::task::yield_now().await;
+            }
+            assert_eq!(budget.free(), total - (4 << 20));
+            // Not for ever, and not behind what was handed on already.
+            assert_eq!(read(packed(23), Duration::from_millis(1)).await.unwrap().unwrap_err(), "busy");
+            let behind = [packed(20), packed(23)].concat();
+            assert_eq!(read(behind, Duration::from_secs(600)).await.unwrap().unwrap_err(), "busy");
+            drop(other);
+            assert_eq!(waits.await.unwrap(), Ok(b"small".to_vec()));
+            assert_eq!(budget.free(), total);
+        });
     }
 
     #[test]

@@ -1,11 +1,13 @@
 //! What a request takes beside its tiles: the buffers of its connection and of its answer, and the window of a
 //! decompressor. A share of the memory is set aside for this, so that tiles and requests never wait for each other in a
-//! circle: who holds memory for a tile takes from this share only what is free.
+//! circle: who holds memory for a tile takes from this share only what is free, and who waits for a wide window holds
+//! nothing.
 
 use std::{
     pin::Pin,
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     task::{Context, Poll},
+    time::Duration,
 };
 
 use axum::{
@@ -22,7 +24,7 @@ use super::{
     inflate::OVERHEAD,
     problem::{Refusal, internal},
 };
-use crate::admission::Permit;
+use crate::admission::{AdmissionError, Budget, Permit};
 
 /// What every request takes: what was read and not looked at, what was written and not sent, and the state of both.
 pub(super) const REQUEST: u64 = 256 << 10;
@@ -37,22 +39,49 @@ pub(super) const fn share(memory: u64) -> u64 {
 
 /// The permit of a request: it lasts until request and answer are both done with.
 #[derive(Clone, Debug)]
-pub(super) struct Charge(Arc<Mutex<Permit>>);
+pub(super) struct Charge {
+    permit: Arc<Mutex<Permit>>,
+    budget: Budget,
+    deadline: Duration,
+}
 
 impl Charge {
-    pub(super) fn new(permit: Permit) -> Self {
-        Self(Arc::new(Mutex::new(permit)))
+    /// So many bytes of this budget, when their turn comes.
+    pub(super) async fn new(budget: &Budget, bytes: u64, deadline: Duration) -> Result<Self, AdmissionError> {
+        let permit = budget.reserve(bytes, deadline).await?;
+        Ok(Self { permit: Arc::new(Mutex::new(permit)), budget: budget.clone(), deadline })
     }
 
-    /// Takes what a window needs, unless as much was taken before. It does not wait for it: see the module.
-    pub(super) fn add_window(&self, window: u64) -> Result<(), Refusal> {
-        let mut permit = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        permit.grow_to(REQUEST + OVERHEAD + window).map_err(|error| {
-            let mut refusal = Refusal::from(error);
-            refusal.0.title = "The body's compression needs more memory than there is".to_owned();
-            refusal
-        })
+    fn permit(&self) -> MutexGuard<'_, Permit> {
+        self.permit.lock().unwrap_or_else(PoisonError::into_inner)
     }
+
+    /// Takes what a decompressor with such a window needs, unless as much was taken before; if it is not there it does
+    /// not wait for it.
+    pub(super) fn add_window(&self, window: u64) -> Result<(), Refusal> {
+        self.permit().grow_to(REQUEST + OVERHEAD + window).map_err(for_window)
+    }
+
+    /// The same at the start of a body, when nothing else is held: waits for its turn, and until then gives back what it
+    /// has.
+    pub(super) async fn wait_window(&self, window: u64) -> Result<(), Refusal> {
+        let bytes = REQUEST + OVERHEAD + window;
+        let grown = self.permit().grow_to(bytes);
+        let taken = match grown {
+            Err(AdmissionError::Busy { .. }) => {
+                self.permit().shrink_to(0);
+                self.budget.reserve(bytes, self.deadline).await.map(|permit| *self.permit() = permit)
+            }
+            grown => grown,
+        };
+        taken.map_err(for_window)
+    }
+}
+
+fn for_window(error: AdmissionError) -> Refusal {
+    let mut refusal = Refusal::from(error);
+    refusal.0.title = "The body's compression needs more memory than there is".to_owned();
+    refusal
 }
 
 /// Takes a request's memory before anything is done for it, waiting for its turn, and keeps it until the answer is sent.
@@ -64,8 +93,7 @@ pub(super) async fn charge(
     let packed = request.headers().contains_key(header::CONTENT_ENCODING);
     let wanted = REQUEST + if packed { OVERHEAD + WINDOW } else { 0 };
     let wanted = wanted.min(service.requests.total());
-    let permit = service.requests.reserve(wanted, service.config.queue_deadline).await?;
-    let charge = Charge::new(permit);
+    let charge = Charge::new(&service.requests, wanted, service.config.queue_deadline).await?;
     request.extensions_mut().insert(charge.clone());
     let response = next.run(request).await;
     Ok(response.map(|body| keep(body, charge)))

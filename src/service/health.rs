@@ -8,6 +8,10 @@ use std::{
 use axum::{extract::State, http::StatusCode};
 
 use super::{Shared, problem::Refusal, query::NoQuery, work::blocking};
+use crate::wire::Problem;
+
+/// Seconds after which it is worth asking again whether the images are known.
+const RECOVERING_AGAIN: u64 = 5;
 
 /// Why a service that runs should be sent no work.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,7 +36,7 @@ impl Readiness {
         }
     }
 
-    fn has(&self, reason: Reason) -> bool {
+    pub(super) fn has(&self, reason: Reason) -> bool {
         self.0.load(Ordering::Relaxed) & reason as u8 != 0
     }
 }
@@ -53,6 +57,12 @@ pub(super) fn disk(folder: &Path) -> std::io::Result<Disk> {
     Ok(Disk { size: bytes(stat.f_blocks), free: bytes(stat.f_bavail) })
 }
 
+/// The answer as long as the images are not known.
+pub(super) fn recovering() -> Refusal {
+    let detail = "it reads what it kept before it was started again";
+    Problem::new(503, "recovering", "The service is starting", detail).with("retry_after", RECOVERING_AGAIN).into()
+}
+
 /// Why no work should be sent, if so. Blocks.
 pub(super) fn unready(service: &Shared) -> Option<Refusal> {
     if service.readiness.has(Reason::Draining) {
@@ -60,8 +70,7 @@ pub(super) fn unready(service: &Shared) -> Option<Refusal> {
         return Some(Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "draining", "The service is stopping", detail));
     }
     if service.readiness.has(Reason::Recovering) {
-        let detail = "it reads what it kept before it was started again";
-        return Some(Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "recovering", "The service is starting", detail));
+        return Some(recovering());
     }
     let reserve = service.config.disk_reserve;
     let detail = match disk(&service.config.data_dir) {

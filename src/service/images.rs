@@ -20,18 +20,19 @@ use serde_json::{Value, json};
 
 use super::{
     Shared,
+    auth::Owner,
     body::Frames,
     charge::Charge,
     picture::{encode_png, write_file},
     problem::{Refusal, corners},
     query::{Form, NoQuery, Parameters, attributes},
     regions,
-    registry::{Id, Opened, no_image},
+    registry::{Id, Opened, Reading, no_image},
     results::file_response,
     work::{Stop, blocking},
 };
 use crate::{
-    admission::AdmissionError,
+    admission::{AdmissionError, Permit},
     filter::{Rect, TileGeometry, geometry::Halo, samples::MAX_SAMPLES_PER_PIXEL},
     image::{Announced, Description, Image, Inner, RegionState, description::channels_from_json, disk_bytes},
     stitch::{CanvasError, ExrOptions, Pixels, StitchError, StoredPixels, exr},
@@ -194,31 +195,46 @@ impl Opened {
         }
     }
 
-    /// The image as an EXR file.
-    fn exr(&self, service: &Shared, options: &ExrOptions, partial: bool, stop: &AtomicBool) -> Result<File, Refusal> {
+    /// The image as an EXR file. One at a time may make it.
+    fn exr(&self, service: &Shared, options: &ExrOptions, partial: bool, stop: &AtomicBool) -> Result<Exr, Refusal> {
         self.image.flush()?;
         self.consistent(partial, stop, |snapshot, settled, replacements| {
             if settled && let Some(file) = self.image.result(options) {
-                return Ok(Some(file));
+                return Ok(Some((file, Kept::Result(Reading::new(&self.entry)))));
             }
             self.image.verify(stop)?;
             let mut full = options.clone();
             if snapshot.missing > 0 {
                 full.attributes.insert("rpfd:missing".into(), snapshot.missing.to_string());
             }
-            if !settled {
-                let file = write_file(&service.config.data_dir, |out| Ok(exr::encode(snapshot, &full, out).map(drop)?));
-                return Ok(Some(file?));
+            // There is disk set aside for one result, which may still be read.
+            if !settled || self.entry.is_read() {
+                let (folder, permit) = (&service.config.data_dir, service.unread.none());
+                let written = write_file(folder, permit, |out| Ok(exr::encode(snapshot, &full, out).map(drop)?));
+                return written.map(|(file, permit)| Some((file, Kept::Other(permit))));
             }
             // It will not change any more: worth keeping.
+            self.image.forget_result();
             let file = tempfile::NamedTempFile::new_in(self.image.folder())?;
             let mut out = io::BufWriter::with_capacity(256 << 10, file);
             exr::encode(snapshot, &full, &mut out)?;
             let file = out.into_inner().map_err(io::IntoInnerError::into_error)?;
             let reader = file.reopen()?;
-            Ok(self.image.keep_result(file, options, replacements).then_some(reader))
+            let kept = Kept::Result(Reading::new(&self.entry));
+            Ok(self.image.keep_result(file, options, replacements).then_some((reader, kept)))
         })
     }
+}
+
+/// An EXR file, and what keeps its room on the disk.
+type Exr = (File, Kept);
+
+/// What an answer keeps until it is sent.
+enum Kept {
+    /// Room of the image itself.
+    Result(#[expect(dead_code, reason = "it lives")] Reading),
+    /// Room for results that nobody has read.
+    Other(#[expect(dead_code, reason = "it lives")] Permit),
 }
 
 /// The pixels of an image at a moment, as long as somebody waits for them.
@@ -288,7 +304,7 @@ fn described(body: &[u8], service: &Shared) -> Result<(Id, Description), Refusal
             format!("{} x {} is {pixels} pixels: this service takes images of {most} at most", size[0], size[1]);
         return Err(Refusal::new(StatusCode::PAYLOAD_TOO_LARGE, "image_too_large", "The image is too large", detail));
     }
-    let mut description = Description { size, method, seed, leave_out, neighbors: announced, disk: 0 };
+    let mut description = Description { size, method, seed, leave_out, neighbors: announced, owner: None, disk: 0 };
     if let Some(announced) = &mut description.neighbors {
         // A quarter, so that a few regions are at work while tiles come in.
         let (threads, most) = (config.threads, service.budget.total());
@@ -322,10 +338,13 @@ fn announced(parameters: &mut Parameters) -> Result<Announced, Refusal> {
 pub(super) async fn open(State(service): State<Shared>, charge: Charge, request: Request) -> Result<Response, Refusal> {
     Parameters::of_query(request.uri())?.done("none: an image is described in the body")?;
     let (parts, body) = request.into_parts();
+    let owner = parts.extensions.get::<Owner>().cloned();
     let body = Frames::new(&parts.headers, body, charge, service.pace())?.all(MAX_JSON).await?;
     let (status, id, summary) = blocking(move || {
-        let (id, description) = described(&body, &service)?;
-        let (new, opened) = service.images.open(id, description)?;
+        let (id, mut description) = described(&body, &service)?;
+        description.owner = owner.as_ref().map(|owner| owner.name.to_string());
+        let limit = owner.map_or(usize::MAX, |owner| owner.images);
+        let (new, opened) = service.images.open(id, description, limit)?;
         let status = if new { StatusCode::CREATED } else { StatusCode::OK };
         Ok::<_, Refusal>((status, opened.entry.id.clone(), opened.summary(&service)))
     })
@@ -346,7 +365,7 @@ pub(super) async fn status(State(service): State<Shared>, id: Id, _: NoQuery) ->
     let file = blocking(move || {
         let opened = service.images.find(&id)?;
         opened.image.flush()?;
-        write_file(&service.config.data_dir, |out| Ok(opened.write_status(&service, out)?))
+        write_file(&service.config.data_dir, service.unread.none(), |out| Ok(opened.write_status(&service, out)?))
     });
     Ok(file_response(file.await??, "application/json").await?)
 }
@@ -407,7 +426,8 @@ pub(super) async fn preview(State(service): State<Shared>, id: Id, request: Requ
     let file = blocking(move || {
         opened.image.flush()?;
         opened.consistent(partial, &flag, |snapshot, _, _| {
-            write_file(&service.config.data_dir, |out| encode_png(snapshot, out)).map(Some)
+            let (folder, permit) = (&service.config.data_dir, service.unread.none());
+            write_file(folder, permit, |out| encode_png(snapshot, out)).map(Some)
         })
     });
     Ok(file_response(file.await??, Form::Png.media()).await?)

@@ -29,7 +29,8 @@ pub(super) enum Inflate {
 }
 
 pub(super) struct Zstd {
-    decoder: Decoder<'static>,
+    /// Made when its memory is reserved.
+    decoder: Option<Decoder<'static>>,
     /// The head of a frame, until all of it has been fed to the decoder.
     head: Bytes,
     collected: Vec<u8>,
@@ -37,10 +38,8 @@ pub(super) struct Zstd {
 }
 
 impl Inflate {
-    pub(super) fn zstd() -> io::Result<Self> {
-        let mut decoder = Decoder::new()?;
-        decoder.set_parameter(DParameter::WindowLogMax(MAX_WINDOW_LOG))?;
-        Ok(Self::Zstd(Box::new(Zstd { decoder, head: Bytes::new(), collected: Vec::new(), within: false })))
+    pub(super) fn zstd() -> Self {
+        Self::Zstd(Box::new(Zstd { decoder: None, head: Bytes::new(), collected: Vec::new(), within: false }))
     }
 
     pub(super) fn gzip() -> Self {
@@ -96,12 +95,20 @@ impl Zstd {
             self.head = std::mem::take(&mut self.collected).into();
             return Ok(Some(Inflated::Window(window_bytes(&self.head))));
         }
+        let decoder = match &mut self.decoder {
+            Some(decoder) => decoder,
+            none => {
+                let mut decoder = Decoder::new()?;
+                decoder.set_parameter(DParameter::WindowLogMax(MAX_WINDOW_LOG))?;
+                none.insert(decoder)
+            }
+        };
         loop {
             let from = if self.head.is_empty() { &mut *input } else { &mut self.head };
             let mut out = Vec::with_capacity(BUFFER);
             let mut source = InBuffer::around(from);
             let mut sink = OutBuffer::around(&mut out);
-            let hint = self.decoder.run(&mut source, &mut sink)?;
+            let hint = decoder.run(&mut source, &mut sink)?;
             let taken = source.pos();
             from.advance(taken);
             self.within = hint != 0;
@@ -157,7 +164,7 @@ mod tests {
         let zstd = [pack(&[]), pack(a), skippable.to_vec(), pack(b), pack(&[])].concat();
         let gzip = [gzip(a), gzip(b)].concat();
         for piece in [1, 7, 1000, 65_536, 1 << 20] {
-            let (out, windows) = inflate(Inflate::zstd().unwrap(), &zstd, piece).unwrap();
+            let (out, windows) = inflate(Inflate::zstd(), &zstd, piece).unwrap();
             assert!(out == data, "pieces of {piece}");
             assert_eq!(windows.len(), 5);
             assert!(inflate(Inflate::gzip(), &gzip, piece).unwrap().0 == data, "pieces of {piece}");
@@ -168,7 +175,7 @@ mod tests {
     fn much_out_of_little_comes_in_pieces() {
         let data = vec![0; 20 << 20];
         let zstd = zstd::encode_all(&data[..], 3).unwrap();
-        let (out, windows) = inflate(Inflate::zstd().unwrap(), &zstd, zstd.len()).unwrap();
+        let (out, windows) = inflate(Inflate::zstd(), &zstd, zstd.len()).unwrap();
         assert!(out == data && windows == [2 << 20]);
         let gzip = gzip(&data);
         assert!(inflate(Inflate::gzip(), &gzip, gzip.len()).unwrap().0 == data);
@@ -179,7 +186,7 @@ mod tests {
         let data: Vec<u8> = (0..3000u32).map(|i| (i * i / 7) as u8).collect();
         let (zstd, gzip) = (zstd::encode_all(&data[..], 3).unwrap(), gzip(&data));
         for end in 1..zstd.len() {
-            let error = inflate(Inflate::zstd().unwrap(), &zstd[..end], 64).unwrap_err();
+            let error = inflate(Inflate::zstd(), &zstd[..end], 64).unwrap_err();
             assert_eq!(error.kind(), io::ErrorKind::UnexpectedEof, "cut at {end}: {error}");
         }
         for end in 1..gzip.len() {
@@ -193,7 +200,7 @@ mod tests {
             good.extend_from_slice(b"garbage");
             good
         };
-        assert!(inflate(Inflate::zstd().unwrap(), &garbage(zstd), 64).is_err());
+        assert!(inflate(Inflate::zstd(), &garbage(zstd), 64).is_err());
         assert!(inflate(Inflate::gzip(), &garbage(gzip), 64).is_err());
     }
 }

@@ -35,13 +35,15 @@ use crate::admission::Budget;
 /// The content type of what is served.
 const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// What happens to a tile, one after another.
+/// What happens to a tile, or to a region that is made of bare cores, one after another.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Phase {
     /// Waiting for memory.
     Queue,
-    /// Reading its samples.
+    /// Reading its samples: from the client, or from the disk.
     Receive,
+    /// Waiting for a thread.
+    Turn,
     /// Filtering.
     Filter,
     /// Keeping what came out: on the canvas, or for the client to read.
@@ -53,6 +55,7 @@ impl Phase {
         match self {
             Self::Queue => "queue",
             Self::Receive => "receive",
+            Self::Turn => "turn",
             Self::Filter => "filter",
             Self::Write => "write",
         }
@@ -113,15 +116,19 @@ pub(super) struct Metrics {
     in_flight: Gauge,
     problems: Family<Code, Counter>,
     tiles: Family<Outcome, Counter>,
+    regions: Family<Outcome, Counter>,
     phases: Family<PhaseName, Histogram, Seconds>,
-    /// Tiles that wait for memory.
+    /// Tiles and regions that wait for memory.
     waiting: Gauge,
     pub(super) connections: Gauge,
     images: Gauge,
+    images_in_memory: Gauge,
     memory_used: Bytes,
     memory_limit: Bytes,
     unread_used: Bytes,
     unread_limit: Bytes,
+    images_used: Bytes,
+    images_limit: Bytes,
     disk_free: Bytes,
     disk_size: Bytes,
     ready: Gauge,
@@ -154,14 +161,18 @@ impl Metrics {
             in_flight: Gauge::default(),
             problems: Family::default(),
             tiles: Family::default(),
+            regions: Family::default(),
             phases: Family::new_with_constructor(Seconds),
             waiting: Gauge::default(),
             connections: Gauge::default(),
             images: Gauge::default(),
+            images_in_memory: Gauge::default(),
             memory_used: Gauge::default(),
             memory_limit: Gauge::default(),
             unread_used: Gauge::default(),
             unread_limit: Gauge::default(),
+            images_used: Gauge::default(),
+            images_limit: Gauge::default(),
             disk_free: Gauge::default(),
             disk_size: Gauge::default(),
             ready: Gauge::default(),
@@ -186,36 +197,38 @@ impl Metrics {
         own.register("requests_in_flight", "Requests whose answer is not all sent", all.in_flight.clone());
         own.register("problems", "Refusals and failures by code, in answers and within streams", all.problems.clone());
         own.register("tiles", "Tiles by what became of them", all.tiles.clone());
-        own.register_with_unit("tile_phase", "Time that tiles took, by phase", Unit::Seconds, all.phases.clone());
-        own.register("queue_length", "Tiles that wait for memory", all.waiting.clone());
+        own.register("regions", "Regions of bare cores by what became of them", all.regions.clone());
+        own.register_with_unit(
+            "tile_phase",
+            "Time that tiles and regions took, by phase",
+            Unit::Seconds,
+            all.phases.clone(),
+        );
+        own.register("queue_length", "Tiles and regions that wait for memory", all.waiting.clone());
         own.register("connections", "Open connections", all.connections.clone());
         own.register("images_open", "Images that are open", all.images.clone());
+        own.register("images_in_memory", "Those of them that are in memory", all.images_in_memory.clone());
         for (name, help, gauge) in [
             ("memory_used", "Memory reserved for tiles and requests", &all.memory_used),
             ("memory_limit", "Memory that tiles and requests may have", &all.memory_limit),
             ("unread_results", "Disk reserved for results that nobody has read yet", &all.unread_used),
             ("unread_results_limit", "Disk that such results may have", &all.unread_limit),
+            ("images_disk", "Disk set aside for images", &all.images_used),
+            ("images_disk_limit", "Disk that images may have", &all.images_limit),
+            ("disk_free", "Free space of the data folder's file system", &all.disk_free),
+            ("disk_size", "Size of the data folder's file system", &all.disk_size),
         ] {
             own.register_with_unit(name, help, Unit::Bytes, gauge.clone());
         }
-        own.register_with_unit(
-            "disk_free",
-            "Free space of the data folder's file system",
-            Unit::Bytes,
-            all.disk_free.clone(),
-        );
-        own.register_with_unit(
-            "disk_size",
-            "Size of the data folder's file system",
-            Unit::Bytes,
-            all.disk_size.clone(),
-        );
         own.register("ready", "Whether the service takes work: 1 or 0", all.ready.clone());
         // So that a rate is there from the first of its kind on.
         for outcome in ["filtered", "stored", "repeated", "failed", "stopped"] {
             drop(all.tiles.get_or_create(&Outcome { outcome }));
         }
-        for phase in [Phase::Queue, Phase::Receive, Phase::Filter, Phase::Write] {
+        for outcome in ["filtered", "failed", "stopped"] {
+            drop(all.regions.get_or_create(&Outcome { outcome }));
+        }
+        for phase in [Phase::Queue, Phase::Receive, Phase::Turn, Phase::Filter, Phase::Write] {
             drop(all.phases.get_or_create(&PhaseName { phase: phase.name() }));
         }
         all
@@ -248,12 +261,23 @@ impl Metrics {
         self.tiles.get_or_create(&Outcome { outcome }).inc();
     }
 
-    /// A tile went through a phase that began then.
-    pub(super) fn phase(&self, phase: Phase, began: Instant) {
-        self.phases.get_or_create(&PhaseName { phase: phase.name() }).observe(began.elapsed().as_secs_f64());
+    /// A region is done with, for now: `filtered`, or with the code of a problem.
+    pub(super) fn region(&self, what: &str) {
+        let outcome = ["filtered", "stopped"].into_iter().find(|outcome| *outcome == what).unwrap_or("failed");
+        self.regions.get_or_create(&Outcome { outcome }).inc();
     }
 
-    /// A tile waits for memory; counted until it is dropped.
+    /// A tile went through a phase that began then.
+    pub(super) fn phase(&self, phase: Phase, began: Instant) {
+        self.took(phase, began.elapsed());
+    }
+
+    /// A phase took so long.
+    pub(super) fn took(&self, phase: Phase, taken: Duration) {
+        self.phases.get_or_create(&PhaseName { phase: phase.name() }).observe(taken.as_secs_f64());
+    }
+
+    /// A tile, or region, waits for memory; counted until it is dropped.
     pub(super) fn wait(&self) -> Counted {
         Counted::new(&self.waiting)
     }
@@ -268,6 +292,10 @@ impl Metrics {
         self.unread_limit.set(bytes(unread.total()));
         self.unread_used.set(bytes(used(unread)));
         self.images.set(bytes(service.images.count() as u64));
+        self.images_in_memory.set(bytes(service.images.in_memory() as u64));
+        let [used, limit] = service.images.disk();
+        self.images_used.set(bytes(used));
+        self.images_limit.set(bytes(limit));
         self.ready.set(unready(service).is_none().into());
         if let Ok(disk) = disk(&service.config.data_dir) {
             self.disk_free.set(bytes(disk.free));

@@ -22,6 +22,7 @@ mod picture;
 mod problem;
 mod query;
 mod receive;
+mod recover;
 mod regions;
 mod registry;
 mod results;
@@ -59,8 +60,8 @@ use work::Work;
 
 /// Connections at once to the address for metrics.
 const METRICS_CONNECTIONS: usize = 16;
-/// How often images that nobody uses are looked for.
-const TIDY: Duration = Duration::from_secs(30);
+/// How often images that nobody uses are looked for, at least and at most.
+const TIDY: [Duration; 2] = [Duration::from_secs(30), Duration::from_millis(100)];
 
 /// The service could not start or go on.
 #[derive(Debug, thiserror::Error)]
@@ -156,6 +157,8 @@ pub struct Service {
     listener: TcpListener,
     address: SocketAddr,
     metrics: Option<(TcpListener, SocketAddr)>,
+    /// What was found in the data folder.
+    found: Vec<PathBuf>,
     inner: Shared,
 }
 
@@ -193,14 +196,15 @@ impl Service {
         let share = charge::share(config.memory.0);
         let [budget, requests, unread] =
             [config.memory.0 - share, share, config.unread_results.0].map(|bytes| Budget::new(bytes, config.queue));
-        let images = Images::start(&config).map_err(|error| match error {
+        let (images, found) = Images::start(&config).map_err(|error| match error {
             StartError::InUse => ServeError::InUse { path: config.data_dir.clone() },
             StartError::Io(source) => data_dir(source),
         })?;
         let (counts, readiness) = (Metrics::new(), Readiness::default());
+        readiness.set(Reason::Recovering, !found.is_empty());
         let spare = Spare::new(budget.clone());
         let inner = Inner { config, budget, spare, requests, unread, work, images, auth, metrics: counts, readiness };
-        Ok(Self { listener, address, metrics, inner: Arc::new(inner) })
+        Ok(Self { listener, address, metrics, found, inner: Arc::new(inner) })
     }
 
     /// The address it listens on, with the port that it got.
@@ -218,10 +222,10 @@ impl Service {
         Reload(Arc::clone(&self.inner))
     }
 
-    /// Answers requests until `shutdown` is done, and then finishes those that were begun, within the deadline of the
+    /// Recovers the images that are in the data folder, and answers requests, until `shutdown` is done, and then finishes those that were begun, within the deadline of the
     /// configuration. Needs a tokio runtime with I/O and time.
     pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<(), ServeError> {
-        let Self { listener, address, metrics, inner } = self;
+        let Self { listener, address, metrics, found, inner } = self;
         let failed = |source| ServeError::Listen { address, source };
         let listener = tokio::net::TcpListener::from_std(listener).map_err(failed)?;
         let (stop, stopping) = watch::channel(false);
@@ -237,7 +241,7 @@ impl Service {
                 accept(&listener, &router, &serving, &inner, METRICS_CONNECTIONS, &mut connections, never).await;
             });
         }
-        inner.images.resume(&inner);
+        let recovering = tokio::spawn(recover::recover(Arc::clone(&inner), found));
         let tidying = tokio::spawn(tidy(Arc::clone(&inner)));
         let router = routes::router(Arc::clone(&inner));
         let (config, simd) = (&inner.config, inner.config.simd.name());
@@ -253,6 +257,7 @@ impl Service {
         }
         // What is not filtered yet goes on at the next start.
         tidying.abort();
+        recovering.abort();
         inner.images.stop();
         Ok(())
     }
@@ -260,7 +265,8 @@ impl Service {
 
 /// Sees to images, and memory, that nobody uses, now and then.
 async fn tidy(inner: Shared) {
-    let mut interval = tokio::time::interval(TIDY.min(inner.config.image_ttl / 4));
+    let mut interval =
+        tokio::time::interval(TIDY[0].min(inner.config.image_ttl / 4).min(inner.config.image_idle).max(TIDY[1]));
     loop {
         interval.tick().await;
         inner.spare.tidy();

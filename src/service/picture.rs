@@ -1,27 +1,85 @@
 //! Long answers, pictures mostly: written to a file without a name first, so that their length and their success are
-//! known.
+//! known. Their room on the disk is that of results which nobody has read yet.
 
 use std::{
     fs::File,
-    io::{BufWriter, Seek, Write},
+    io::{self, BufWriter, Seek, SeekFrom, Write},
     path::Path,
 };
 
+use axum::http::StatusCode;
+
 use super::problem::Refusal;
 use crate::{
+    admission::Permit,
     filter::{Filtered, Rect},
     picture::write_png,
     stitch::{CanvasError, Pixels},
 };
 
-/// Writes an answer to a file without a name in this folder. Blocks.
+/// Bytes that are reserved at a time.
+const STEP: u64 = 1 << 20;
+
+/// A file whose bytes are reserved before they are written.
+#[derive(Debug)]
+pub(super) struct Charged {
+    file: File,
+    at: u64,
+    permit: Permit,
+    refused: bool,
+}
+
+impl Write for Charged {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let end = self.at + bytes.len() as u64;
+        if end > self.permit.bytes() {
+            let grown = self.permit.grow_to(end + STEP).or_else(|_| self.permit.grow_to(end));
+            grown.map_err(|error| {
+                self.refused = true;
+                io::Error::new(io::ErrorKind::StorageFull, error)
+            })?;
+        }
+        let written = self.file.write(bytes)?;
+        self.at += written as u64;
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Seek for Charged {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        self.at = self.file.seek(to)?;
+        Ok(self.at)
+    }
+}
+
+/// Writes an answer to a file without a name in this folder. Its bytes are those of the permit, and as many more as it
+/// needs: to be kept as long as the file is. Blocks.
 pub(super) fn write_file(
     folder: &Path,
-    write: impl FnOnce(&mut BufWriter<File>) -> Result<(), Refusal>,
-) -> Result<File, Refusal> {
-    let mut out = BufWriter::with_capacity(256 << 10, tempfile::tempfile_in(folder)?);
-    write(&mut out)?;
-    Ok(out.into_inner().map_err(std::io::IntoInnerError::into_error)?)
+    permit: Permit,
+    write: impl FnOnce(&mut BufWriter<Charged>) -> Result<(), Refusal>,
+) -> Result<(File, Permit), Refusal> {
+    let file = tempfile::tempfile_in(folder)?;
+    let mut out = BufWriter::with_capacity(256 << 10, Charged { file, at: 0, permit, refused: false });
+    let written = write(&mut out).and_then(|()| Ok(out.flush()?));
+    let (Charged { file, mut permit, refused, .. }, _) = out.into_parts();
+    if refused {
+        let detail = "the answer does not fit into the disk that is left for results that nobody has read: ask again \
+                      when others have read theirs";
+        return Err(Refusal::new(
+            StatusCode::INSUFFICIENT_STORAGE,
+            "results_unread",
+            "Too many results wait to be read",
+            detail,
+        ));
+    }
+    written?;
+    permit.shrink_to(file.metadata()?.len());
+    Ok((file, permit))
 }
 
 /// Writes pixels as a PNG, row by row.

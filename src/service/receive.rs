@@ -5,7 +5,7 @@ use std::time::Instant;
 use axum::http::StatusCode;
 use bytes::{Buf, Bytes};
 
-use super::{body::Frames, metrics::Phase, problem::Refusal, results::Results, stream::Call};
+use super::{body::Frames, metrics::Phase, problem::Refusal, stream::Call};
 use crate::{
     admission::{AdmissionError, Permit},
     filter::{
@@ -192,7 +192,7 @@ async fn announce(call: &Call, header: Header) -> Result<Open, Fault> {
         fits(call, &header, header.max_per_pixel()).map_err(tile)?;
     }
     let deadline = service.config.queue_deadline;
-    let unread = service.unread.reserve(Results::bytes(geometry.core()), deadline).await;
+    let unread = service.unread.reserve(call.result_bytes(geometry.core()), deadline).await;
     // Whoever does not read what there is gets no more.
     let unread = unread.map_err(|error| {
         let why = format!("there is no room for this result on the service's disk: {error}");

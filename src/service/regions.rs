@@ -3,15 +3,26 @@
 use std::{
     sync::{
         Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use tokio::{sync::Notify, task::JoinSet, time::sleep};
+use tokio_util::sync::CancellationToken;
 
-use super::{Shared, problem::Refusal, registry::Opened, work::blocking};
-use crate::{config::MAX_DEADLINE, wire::Problem};
+use super::{
+    Shared,
+    metrics::Phase,
+    problem::Refusal,
+    registry::Opened,
+    work::{blocking, stopped},
+};
+use crate::{
+    filter::Execution,
+    image::{ImageError, Job},
+    wire::Problem,
+};
 
 /// Pauses after failures: the first, and the longest; each is twice the one before.
 const PAUSES: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(60)];
@@ -25,9 +36,30 @@ pub(super) struct Runner {
     pub(super) wake: Notify,
     /// Why it cannot go on at the moment.
     pub(super) trouble: Mutex<Option<Box<Problem>>>,
+    /// Stops the work on the image: it is forgotten, or the service ends.
+    pub(super) stop: CancellationToken,
+    /// Pixels that a part of a region may have: fewer after one that took too long.
+    pixels: AtomicU64,
+}
+
+impl Default for Runner {
+    fn default() -> Self {
+        Self {
+            running: AtomicBool::new(false),
+            wake: Notify::new(),
+            trouble: Mutex::default(),
+            stop: CancellationToken::new(),
+            pixels: AtomicU64::new(u64::MAX),
+        }
+    }
 }
 
 impl Runner {
+    /// The next region is filtered in smaller parts than this one, as far as there are any.
+    fn too_long(&self, job: &Job) {
+        self.pixels.fetch_min(job.pixels / 2, Ordering::Relaxed);
+    }
+
     fn trouble(&self, problem: Option<Box<Problem>>) {
         *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = problem;
     }
@@ -53,10 +85,15 @@ async fn run(service: Shared, mut opened: Opened) {
             Ok(()) => opened.entry.runner.trouble(None),
             Err(refusal) if refusal.0.code == "stopped" => break,
             Err(refusal) => {
-                let id = &opened.entry.id.0;
+                let (id, late) = (&opened.entry.id.0, refusal.0.code == "work_timeout");
+                // What took too long is different the next time.
+                pause = if late { PAUSES[0] } else { pause };
                 tracing::warn!(id, problem = refusal.0.detail, seconds = pause.as_secs(), "regions wait");
                 opened.entry.runner.trouble(Some(refusal.0));
-                sleep(pause).await;
+                let stop = opened.entry.runner.stop.clone();
+                if stop.run_until_cancelled(sleep(pause)).await.is_none() {
+                    break;
+                }
                 pause = (pause * 2).min(PAUSES[1]);
                 // An image that has failed is opened anew.
                 let (images, id) = (Arc::clone(&service), opened.entry.id.clone());
@@ -89,13 +126,8 @@ async fn drain(service: &Shared, opened: &Opened) -> Result<(), Refusal> {
             Some(_) => None,
             None if jobs.len() > service.work.jobs() => None,
             None => {
-                let (image, shared) = (Arc::clone(&opened.image), Arc::clone(service));
-                let next = blocking(move || {
-                    if image.stopping().load(Ordering::Relaxed) {
-                        return Err(crate::image::ImageError::Stopped(crate::filter::Stopped));
-                    }
-                    image.next_job(shared.config.threads, shared.budget.total())
-                });
+                let (opened, shared) = (opened.clone(), Arc::clone(service));
+                let next = blocking(move || next_job(&shared, &opened));
                 match next.await.and_then(|next| next.map_err(Refusal::from)) {
                     Ok(next) => next,
                     Err(refusal) => {
@@ -107,23 +139,7 @@ async fn drain(service: &Shared, opened: &Opened) -> Result<(), Refusal> {
         };
         match next {
             Some(job) => {
-                let (service, image) = (Arc::clone(service), Arc::clone(&opened.image));
-                jobs.spawn(async move {
-                    // Others finish some time: there is nobody to be told that it takes long.
-                    let permit = match service.reserve(job.bytes, std::future::ready(()), MAX_DEADLINE).await {
-                        Ok(permit) => permit,
-                        Err(error) => {
-                            image.give_back(&job);
-                            return Err(error.into());
-                        }
-                    };
-                    let done = service.work.run(move |pool, _| {
-                        let done = image.run(&job, pool);
-                        drop(permit);
-                        Ok(done?)
-                    });
-                    done.await
-                });
+                jobs.spawn(filter(Arc::clone(service), opened.clone(), job));
             }
             None if jobs.is_empty() => return failed.map_or(Ok(()), Err),
             None => {
@@ -138,4 +154,57 @@ async fn drain(service: &Shared, opened: &Opened) -> Result<(), Refusal> {
             }
         }
     }
+}
+
+/// The next region that can be filtered. Blocks.
+fn next_job(service: &Shared, opened: &Opened) -> Result<Option<Job>, ImageError> {
+    let runner = &opened.entry.runner;
+    if runner.stop.is_cancelled() {
+        return Err(crate::filter::Stopped.into());
+    }
+    opened.image.next_job(service.config.threads, service.budget.total(), runner.pixels.load(Ordering::Relaxed))
+}
+
+/// Filters a region when its turn comes.
+async fn filter(service: Shared, opened: Opened, job: Job) -> Result<(), Refusal> {
+    let (image, runner, metrics) = (Arc::clone(&opened.image), &opened.entry.runner, &service.metrics);
+    let (waiting, asked) = (metrics.wait(), Instant::now());
+    let permit = tokio::select! {
+        permit = service.budget.reserve_own(job.bytes) => permit.map_err(Refusal::from),
+        () = runner.stop.cancelled() => Err(stopped()),
+    };
+    drop(waiting);
+    let permit = permit.inspect_err(|_| image.give_back(&job))?;
+    service.spare.make_room();
+    metrics.phase(Phase::Queue, asked);
+    let (shared, entry, ready) = (Arc::clone(&service), Arc::clone(&opened.entry), Instant::now());
+    let work = service.work.run(move |pool, stop| {
+        let _permit = permit;
+        shared.metrics.phase(Phase::Turn, ready);
+        let simd = shared.config.simd;
+        let execution = Execution { pool: Some(pool), stop: Some(stop), simd, ..Execution::default() };
+        let done = image.run(&job, &execution);
+        if let Err(ImageError::Stopped(_)) = done {
+            // If it was not for the time, this image is not filtered any more.
+            entry.runner.too_long(&job);
+        }
+        Ok(done?)
+    });
+    let done = tokio::select! {
+        done = work => done,
+        () = runner.stop.cancelled() => Err(stopped()),
+    };
+    metrics.region(done.as_ref().map_or_else(|refusal| &*refusal.0.code, |_| "filtered"));
+    let spent = done.map_err(|mut refusal| {
+        if refusal.0.code == "work_timeout" {
+            let seconds = service.config.work_deadline.as_secs_f64();
+            refusal.0.detail =
+                format!("filtering a region took more than {seconds} seconds: it is tried again in smaller parts");
+        }
+        refusal
+    })?;
+    for (phase, taken) in [(Phase::Receive, spent.read), (Phase::Filter, spent.filter), (Phase::Write, spent.write)] {
+        metrics.took(phase, taken);
+    }
+    Ok(())
 }

@@ -7,8 +7,8 @@ use std::{
     io,
     path::{Path, PathBuf},
     sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicU64, Ordering},
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError,
+        atomic::{AtomicU64, Ordering},
     },
     time::{Duration, SystemTime, UNIX_EPOCH},
 };
@@ -18,9 +18,8 @@ use axum::{
     http::{StatusCode, request::Parts},
 };
 use serde_json::{Value, json};
-use tokio::sync::Notify;
 
-use super::{Shared, problem::Refusal, regions};
+use super::{problem::Refusal, regions};
 use crate::{
     config::Config,
     disk::Directory,
@@ -33,8 +32,6 @@ const MAX_ID: usize = 128;
 /// Folder of the images in the data folder, and the file that one service at a time holds.
 const IMAGES: &str = "images";
 const LOCK: &str = "rpfd.lock";
-/// How long an image that nobody uses stays in memory.
-const LINGER: Duration = Duration::from_secs(30);
 /// How often the time of the last use is written down.
 const TOUCH: Duration = Duration::from_secs(60);
 
@@ -76,6 +73,8 @@ pub(super) fn no_image(id: &str) -> Refusal {
 #[derive(Debug)]
 pub(super) struct Entry {
     pub(super) id: Id,
+    /// The name of the token with which it was opened.
+    owner: Option<String>,
     /// Bytes of disk that are set aside for it.
     disk: u64,
     /// Seconds since 1970 at which it was last used, and at which that was written down.
@@ -84,11 +83,15 @@ pub(super) struct Entry {
     slot: Mutex<Slot>,
     /// One result at a time is made.
     pub(super) encoding: tokio::sync::Mutex<()>,
+    /// Answers on their way that read the result which the image keeps.
+    readers: AtomicU64,
+    /// Where its disk counts once it is forgotten, until nobody is at work on it or reads of it any more.
+    left: OnceLock<Arc<AtomicU64>>,
     pub(super) runner: regions::Runner,
 }
 
 #[derive(Debug)]
-enum Slot {
+pub(super) enum Slot {
     /// On the disk only; its summary as it was last.
     Closed(Value),
     Open(Arc<Image>),
@@ -105,15 +108,18 @@ pub(super) struct Opened {
 }
 
 impl Entry {
-    fn new(id: Id, disk: u64, touched: u64, slot: Slot) -> Self {
+    pub(super) fn new(id: Id, owner: Option<String>, disk: u64, touched: u64, slot: Slot) -> Self {
         Self {
             id,
+            owner,
             disk,
             touched: touched.into(),
             written: touched.into(),
             slot: Mutex::new(slot),
             encoding: tokio::sync::Mutex::new(()),
-            runner: regions::Runner { running: AtomicBool::new(false), wake: Notify::new(), trouble: Mutex::default() },
+            readers: AtomicU64::new(0),
+            left: OnceLock::new(),
+            runner: regions::Runner::default(),
         }
     }
 
@@ -121,9 +127,39 @@ impl Entry {
         self.slot.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Whether somebody reads the result that the image keeps, or kept.
+    pub(super) fn is_read(&self) -> bool {
+        self.readers.load(Ordering::Relaxed) > 0
+    }
+
     /// Seconds since 1970 at which it was last used.
     pub(super) fn touched(&self) -> u64 {
         self.touched.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Entry {
+    fn drop(&mut self) {
+        if let Some(leaving) = self.left.get() {
+            leaving.fetch_sub(self.disk, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Somebody reads the result that an image keeps.
+#[derive(Debug)]
+pub(super) struct Reading(Arc<Entry>);
+
+impl Reading {
+    pub(super) fn new(entry: &Arc<Entry>) -> Self {
+        entry.readers.fetch_add(1, Ordering::Relaxed);
+        Self(Arc::clone(entry))
+    }
+}
+
+impl Drop for Reading {
+    fn drop(&mut self) {
+        self.0.readers.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -133,11 +169,13 @@ pub(super) struct Images {
     all: Mutex<BTreeMap<Id, Arc<Entry>>>,
     folder: PathBuf,
     limit: usize,
-    /// Bytes of disk for all images, and those of images that are just being removed.
+    /// Bytes of disk for all images, and those of images that are forgotten and not quite gone.
     disk: u64,
-    leaving: AtomicU64,
+    leaving: Arc<AtomicU64>,
     /// How long an image is kept that nobody uses.
     ttl: Duration,
+    /// How long it stays in memory.
+    idle: Duration,
     /// Held as long as this lives.
     _lock: File,
 }
@@ -156,13 +194,13 @@ impl From<io::Error> for StartError {
     }
 }
 
-fn now() -> u64 {
+pub(super) fn now() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |time| time.as_secs())
 }
 
 impl Images {
-    /// Takes the data folder, removes the remains of what was not finished, and opens every image that is there.
-    pub(super) fn start(config: &Config) -> Result<Self, StartError> {
+    /// Takes the data folder, and says what is in it, which is to be [recovered](Self::recover).
+    pub(super) fn start(config: &Config) -> Result<(Self, Vec<PathBuf>), StartError> {
         let lock =
             File::options().read(true).write(true).create(true).truncate(false).open(config.data_dir.join(LOCK))?;
         match lock.try_lock() {
@@ -172,71 +210,34 @@ impl Images {
         }
         let folder = config.data_dir.join(IMAGES);
         fs::create_dir_all(&folder)?;
+        let found = fs::read_dir(&folder)?.map(|found| Ok(found?.path())).collect::<io::Result<_>>()?;
         let images = Self {
             all: Mutex::default(),
             folder,
             limit: config.images,
             disk: config.disk.0,
-            leaving: AtomicU64::new(0),
+            leaving: Arc::default(),
             ttl: config.image_ttl,
+            idle: config.image_idle,
             _lock: lock,
         };
-        for found in fs::read_dir(&images.folder)? {
-            let (name, path) = found.map(|found| (found.file_name(), found.path()))?;
-            match name.to_str().and_then(Id::chosen) {
-                Some(id) => images.recover(id, &path)?,
-                // An image that was just being made, or removed.
-                None => remove(&path)?,
-            }
-        }
-        Ok(images)
+        Ok((images, found))
     }
 
-    fn recover(&self, id: Id, path: &Path) -> io::Result<()> {
-        for found in fs::read_dir(path)? {
-            let found = found?;
-            if found.file_name().to_str().is_none_or(|name| !image::FILES.contains(&name)) {
-                remove(&found.path())?;
-            }
-        }
-        let touched =
-            fs::metadata(path.join(image::TOUCHED)).or_else(|_| fs::metadata(path)).and_then(|m| m.modified());
-        let touched =
-            touched.ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok()).map_or_else(now, |t| t.as_secs());
-        let (disk, slot) = match Image::open(Box::new(Directory::new(path))) {
-            Ok(image) => {
-                let (disk, summary) = (image.description().disk, super::images::summary(&id, &image));
-                // What can go on is kept open.
-                let waits = image.read().regions().is_some_and(|regions| regions.open() > 0);
-                (disk, if waits { Slot::Open(Arc::new(image)) } else { Slot::Closed(summary) })
-            }
-            Err(error) => {
-                tracing::error!(id = id.0, %error, "an image cannot be opened");
-                (
-                    used(path),
-                    if error.is_damage() { Slot::Damaged(error.to_string()) } else { Slot::Closed(Value::Null) },
-                )
-            }
-        };
-        self.lock().insert(id.clone(), Arc::new(Entry::new(id, disk, touched, slot)));
-        Ok(())
-    }
-
-    /// Goes on with what can be filtered. To be called once, in a runtime.
-    pub(super) fn resume(&self, service: &Shared) {
-        for entry in self.entries() {
-            let Slot::Open(image) = &*entry.slot() else { continue };
-            regions::kick(service, &Opened { entry: Arc::clone(&entry), image: Arc::clone(image) });
-        }
-    }
-
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<Id, Arc<Entry>>> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, BTreeMap<Id, Arc<Entry>>> {
         self.all.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// How many there are.
     pub(super) fn count(&self) -> usize {
         self.lock().len()
+    }
+
+    /// How many of them are in memory.
+    pub(super) fn in_memory(&self) -> usize {
+        // One that is just being opened is as good as open.
+        let open = |entry: &&Arc<Entry>| entry.slot.try_lock().map_or(true, |slot| matches!(*slot, Slot::Open(_)));
+        self.entries().iter().filter(open).count()
     }
 
     pub(super) fn entries(&self) -> Vec<Arc<Entry>> {
@@ -303,10 +304,11 @@ impl Images {
         let _ = file.and_then(|file| file.set_modified(UNIX_EPOCH + Duration::from_secs(entry.touched())));
     }
 
-    /// Opens an image, unless there is one with its id: says whether it is new, and gives the one that is there now.
+    /// Opens an image, of which its owner may have so many, unless there is one with its id: says whether it is new, and gives the one that is there now.
     /// Blocks.
-    pub(super) fn open(&self, id: Id, description: Description) -> Result<(bool, Opened), Refusal> {
-        let entry = Arc::new(Entry::new(id.clone(), description.disk, now(), Slot::Gone));
+    pub(super) fn open(&self, id: Id, description: Description, limit: usize) -> Result<(bool, Opened), Refusal> {
+        let (owner, disk) = (description.owner.clone(), description.disk);
+        let entry = Arc::new(Entry::new(id.clone(), owner, disk, now(), Slot::Gone));
         // Whoever finds the entry waits until the image is there.
         let mut slot = entry.slot();
         loop {
@@ -335,7 +337,7 @@ impl Images {
             if all.contains_key(&id) {
                 continue;
             }
-            self.admit(&all, description.disk)?;
+            self.admit(&all, &description, limit)?;
             all.insert(id.clone(), Arc::clone(&entry));
             break;
         }
@@ -355,8 +357,15 @@ impl Images {
         }
     }
 
-    /// Refuses one image more than there may be, or one that takes more disk than is left.
-    fn admit(&self, all: &BTreeMap<Id, Arc<Entry>>, needed: u64) -> Result<(), Refusal> {
+    /// Refuses one image more than there may be, in all or of its owner, or one that takes more disk than is left.
+    fn admit(&self, all: &BTreeMap<Id, Arc<Entry>>, description: &Description, limit: usize) -> Result<(), Refusal> {
+        let (owner, needed) = (&description.owner, description.disk);
+        if owner.is_some() && all.values().filter(|entry| entry.owner == *owner).count() >= limit {
+            let detail = format!("{limit} images opened with this token are open; delete some that are done");
+            return Err(Problem::new(429, "image_quota", "Too many images of this token are open", detail)
+                .with("retry_after", 60)
+                .into());
+        }
         if all.len() >= self.limit {
             return Err(Problem::new(
                 503,
@@ -367,8 +376,7 @@ impl Images {
             .with("retry_after", 60)
             .into());
         }
-        let taken = all.values().map(|entry| entry.disk).sum::<u64>() + self.leaving.load(Ordering::Relaxed);
-        let free = self.disk.saturating_sub(taken);
+        let free = self.disk.saturating_sub(self.taken(all));
         if needed > free {
             let detail = format!(
                 "the image may take {needed} bytes of disk, and of the {} bytes for all images {free} are free",
@@ -402,21 +410,18 @@ impl Images {
     pub(super) fn delete(&self, id: &Id) -> Result<bool, Refusal> {
         let Some(entry) = self.lock().get(id).cloned() else { return Ok(false) };
         let mut slot = entry.slot();
-        if let Slot::Open(image) = &*slot {
-            image.stop();
-        }
         if matches!(*slot, Slot::Gone) {
             return Ok(false);
         }
         let gone = self.folder.join(format!(".gone-{}", Id::new().0));
         fs::rename(self.folder.join(&id.0), &gone)?;
         *slot = Slot::Gone;
+        entry.runner.stop.cancel();
         self.leaving.fetch_add(entry.disk, Ordering::Relaxed);
+        let _ = entry.left.set(Arc::clone(&self.leaving));
         self.lock().remove(id);
         drop(slot);
-        let removed = File::open(&self.folder).and_then(|folder| folder.sync_all()).and_then(|()| remove(&gone));
-        self.leaving.fetch_sub(entry.disk, Ordering::Relaxed);
-        removed?;
+        File::open(&self.folder).and_then(|folder| folder.sync_all()).and_then(|()| remove(&gone))?;
         Ok(true)
     }
 
@@ -431,19 +436,24 @@ impl Images {
                         tracing::warn!(id = entry.id.0, problem = refusal.0.detail, "cannot forget an image")
                     }
                 }
-            } else if now.saturating_sub(entry.touched()) >= LINGER.as_secs() {
+            } else if now.saturating_sub(entry.touched()) >= self.idle.as_secs() {
                 entry.close();
             }
         }
     }
 
-    /// Stops the work on all images. Blocks.
+    /// Stops the work on all images.
     pub(super) fn stop(&self) {
-        for entry in self.entries() {
-            if let Slot::Open(image) = &*entry.slot() {
-                image.stop();
-            }
-        }
+        self.entries().iter().for_each(|entry| entry.runner.stop.cancel());
+    }
+
+    /// Bytes of disk that are set aside for images, and all that there are for them.
+    pub(super) fn disk(&self) -> [u64; 2] {
+        [self.taken(&self.lock()), self.disk]
+    }
+
+    fn taken(&self, all: &BTreeMap<Id, Arc<Entry>>) -> u64 {
+        all.values().map(|entry| entry.disk).sum::<u64>() + self.leaving.load(Ordering::Relaxed)
     }
 
     /// The summaries of all images. Blocks.
@@ -478,7 +488,7 @@ impl Entry {
     }
 }
 
-fn remove(path: &Path) -> io::Result<()> {
+pub(super) fn remove(path: &Path) -> io::Result<()> {
     let removed = match fs::symlink_metadata(path) {
         Ok(found) if found.is_dir() => fs::remove_dir_all(path),
         Ok(_) => fs::remove_file(path),
@@ -488,11 +498,4 @@ fn remove(path: &Path) -> io::Result<()> {
         Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
         _ => Ok(()),
     }
-}
-
-/// Bytes of disk that the files of a folder take.
-fn used(path: &Path) -> u64 {
-    use std::os::unix::fs::MetadataExt;
-    let files = fs::read_dir(path).into_iter().flatten().flatten();
-    files.filter_map(|file| Some(file.metadata().ok()?.blocks() * 512)).sum()
 }

@@ -18,20 +18,22 @@ use axum::{
 };
 use bytes::Bytes;
 use futures_util::{Stream, stream};
-use rustix::fs::FallocateFlags;
+use rustix::{fs::FallocateFlags, io::Errno};
 use tokio::sync::watch;
 use tokio_util::io::ReaderStream;
 
-use super::work::blocking;
+use super::{charge::keep, work::blocking};
 use crate::{admission::Permit, filter::Rect};
 
 /// Bytes read or written at a time.
 const BUFFER: usize = 64 << 10;
 
+/// Bytes that are taken from the disk at the start, so that a full disk can be told of.
+const ROOM: u64 = 64 << 10;
 /// Bytes that are read before their place on the disk is given back.
 const HOLE: u64 = 1 << 20;
-/// More than a result has beside its pixels.
-const AROUND: u64 = 64 << 10;
+/// More than a result has beside its pixels, and than is said of a tile without them.
+pub(super) const AROUND: u64 = 64 << 10;
 
 /// How far the file has been written.
 #[derive(Clone, Copy, Debug, Default)]
@@ -103,6 +105,11 @@ impl Results {
     /// [`finish`](Self::finish); if the results are dropped before that it ends in an error, which cuts the connection.
     pub(super) fn new(folder: &Path) -> io::Result<(Self, impl Stream<Item = io::Result<Bytes>> + Send + use<>)> {
         let file = Arc::new(tempfile::tempfile_in(folder)?);
+        match rustix::fs::fallocate(&*file, FallocateFlags::KEEP_SIZE, 0, ROOM) {
+            // Not every file system can.
+            Ok(()) | Err(Errno::OPNOTSUPP | Errno::NOSYS) => {}
+            Err(error) => return Err(error.into()),
+        }
         let (progress, seen) = watch::channel(Progress::default());
         let unread = Arc::new(Mutex::new(Unread::default()));
         let state = (Arc::clone(&file), Arc::clone(&unread), seen, 0u64);
@@ -172,15 +179,18 @@ fn forget(file: &File, from: u64, to: u64) {
     }
 }
 
-/// A response of this content type whose body is all of a file.
-pub(super) async fn file_response(file: File, media: &'static str) -> io::Result<Response> {
+/// A response of this content type whose body is all of a file. Something is kept until it is sent, or nobody wants it.
+pub(super) async fn file_response(
+    (file, kept): (File, impl Send + Unpin + 'static),
+    media: &'static str,
+) -> io::Result<Response> {
     use tokio::io::AsyncSeekExt;
     let mut file = tokio::fs::File::from_std(file);
     file.rewind().await?;
     let length = file.metadata().await?.len();
     let body = Body::from_stream(ReaderStream::with_capacity(file, BUFFER));
     let headers = [(header::CONTENT_TYPE, media.to_owned()), (header::CONTENT_LENGTH, length.to_string())];
-    Ok((headers, body).into_response())
+    Ok((headers, keep(body, kept)).into_response())
 }
 
 #[cfg(test)]

@@ -7,17 +7,19 @@ use axum::{
     routing::get,
 };
 
-use super::{Shared, auth, body, charge, metrics, openapi, problem::Refusal, trace};
+use super::{Shared, auth, body, charge, metrics, openapi, problem::Refusal, recover, trace};
 
 pub(super) fn router(service: Shared) -> Router {
     let charged = from_fn_with_state(service.clone(), charge::charge);
+    let recovered = from_fn_with_state(service.clone(), recover::recovered);
     openapi::calls()
         .into_iter()
         .fold(Router::new(), |router, call| {
             // Not what says how the service is: that has to be known most when memory is short.
-            let handlers = call.handlers;
             let free = !call.path.starts_with("/v1/");
-            router.route(call.path, if free { handlers } else { handlers.route_layer(charged.clone()) })
+            let handlers = if free { call.handlers } else { call.handlers.route_layer(charged.clone()) };
+            let of_images = call.path.starts_with("/v1/images");
+            router.route(call.path, if of_images { handlers.route_layer(recovered.clone()) } else { handlers })
         })
         .fallback(nothing)
         .method_not_allowed_fallback(not_allowed)

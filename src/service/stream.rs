@@ -33,7 +33,7 @@ use super::{
     query::{Form, Parameters, attributes},
     receive::{Fault, Received, Receiver},
     registry::{Id, Opened},
-    results::{Results, file_response},
+    results::{AROUND, Results, file_response},
     work::{blocking, stopped},
 };
 use crate::{
@@ -96,6 +96,14 @@ impl Call {
         match &self.target {
             Target::Client => Ok(()),
             Target::Image { image, .. } => image.check(header),
+        }
+    }
+
+    /// Bytes of disk that what is said of a tile takes at most, until it is read.
+    pub(super) fn result_bytes(&self, core: Rect) -> u64 {
+        match &self.target {
+            Target::Client => Results::bytes(core),
+            Target::Image { .. } => AROUND,
         }
     }
 
@@ -381,7 +389,12 @@ async fn job(call: Arc<Call>, received: Received, results: Arc<Results>) -> bool
     let core = received.core();
     let (inner, out) = (Arc::clone(&call), Arc::clone(&results));
     let mut fate = Fate::new(&call);
-    let done = call.service.work.run(move |pool, stop| inner.process(received, &out, pool, stop)).await;
+    let ready = Instant::now();
+    let done = call.service.work.run(move |pool, stop| {
+        inner.service.metrics.phase(Phase::Turn, ready);
+        inner.process(received, &out, pool, stop)
+    });
+    let done = done.await;
     call.busy.send_modify(|tiles| *tiles -= 1);
     match done {
         Ok(outcome) => {
@@ -405,12 +418,14 @@ async fn single(call: Call, charge: Charge, request: Request, form: Form) -> Res
     let call = Arc::new(call);
     let inner = Arc::clone(&call);
     let mut fate = Fate::new(&call);
-    let done = call.service.work.run(move |pool, stop| picture(&inner, received, form, pool, stop)).await;
+    let ready = Instant::now();
+    let done = call.service.work.run(move |pool, stop| {
+        inner.service.metrics.phase(Phase::Turn, ready);
+        picture(&inner, received, form, pool, stop)
+    });
+    let done = done.await;
     fate.0 = Some(if done.is_ok() { "filtered" } else { "failed" });
-    let (file, unread) = done?;
-    let answer = file_response(file, form.media()).await?;
-    // The file lies on the disk until it is sent.
-    Ok(answer.map(|body| keep(body, unread)))
+    Ok(file_response(done?, form.media()).await?)
 }
 
 fn picture(
@@ -429,9 +444,8 @@ fn picture(
         options.attributes.insert("rpfd:tile".into(), geometry.core().to_string());
     }
     let pixels = CorePixels(&done.filtered);
-    let file = write_file(&call.service.config.data_dir, |out| match form {
+    write_file(&call.service.config.data_dir, unread, |out| match form {
         Form::Png => encode_png(&pixels, out),
         _ => Ok(crate::stitch::exr::encode(&pixels, &options, out).map(drop)?),
-    })?;
-    Ok((file, unread))
+    })
 }

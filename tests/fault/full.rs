@@ -12,7 +12,9 @@ fn limited(folder: tempfile::TempDir, bytes: u64) -> Server {
     shell.args(["-c", &script, "sh", env!("CARGO_BIN_EXE_rpfd")]);
     // Debian's sh counts so; where sh is bash it has to be told.
     shell.env("POSIXLY_CORRECT", "1");
-    Server::start_by(shell, folder, &["--memory", "64MiB"])
+    let server = Server::start_by(shell, folder, &["--memory", "64MiB"]);
+    server.wait_recovered();
+    server
 }
 
 fn unlimit(server: &Server) {
@@ -57,6 +59,71 @@ fn a_full_disk_refuses_tiles_and_the_image_stays_usable() {
         assert!(server.get("/v1/images/a/result.exr").body == expected);
         let again = server.post("/v1/images/a/tiles", &encode(&samples(SIZE, cores[0], 0, 1))).lines();
         assert_eq!(again[0]["state"], "repeated");
+    }
+}
+
+/// A service whose data folder is a file system of so many bytes, in a name space of its own; none where that is not
+/// allowed.
+fn mounted(bytes: u64) -> Option<Server> {
+    let folder = tempfile::tempdir().unwrap();
+    let mount = format!("mount -t tmpfs -o size={bytes} tmpfs \"$FOLDER\"");
+    let command = |script: &str| {
+        let mut command = Command::new("unshare");
+        command.args(["--mount", "--map-root-user", "sh", "-c", script, "sh", env!("CARGO_BIN_EXE_rpfd")]);
+        command.env("FOLDER", folder.path());
+        command
+    };
+    match command(&mount).output() {
+        Ok(output) if output.status.success() => {}
+        refused => {
+            println!("skipped: a tmpfs cannot be mounted here: {refused:?}");
+            return None;
+        }
+    }
+    let command = command(&format!("{mount} && exec \"$@\""));
+    Some(Server::start_by(command, folder, &["--memory", "64MiB", "--disk-reserve", "64KiB"]))
+}
+
+#[test]
+fn a_full_file_system_refuses_tiles_and_the_image_stays_usable() {
+    const SIZE: [u32; 2] = [96, 96];
+    let method = Method::preset("lean").unwrap();
+    let expected = whole_exr(&samples(SIZE, Rect::new(0, 0, 96, 96), 0, 1), &method, 5);
+    for (halo, opening) in [
+        (17, br#"{"width": 96, "height": 96, "id": "a", "seed": 5, "preset": "lean"}"#.to_vec()),
+        (0, neighbors::opening("a", SIZE, "lean", ("samples", 4))),
+    ] {
+        let Some(server) = mounted(32 << 20) else { return };
+        assert_eq!(server.get("/readyz").status, 200);
+        assert_eq!(server.post("/v1/images", &opening).status, 201);
+        // As the service sees it.
+        let folder = format!("/proc/{}/root{}", server.pid(), server.data_dir().display());
+        let ballast = std::path::Path::new(&folder).join("ballast");
+        let mut file = std::fs::File::create(&ballast).unwrap();
+        let full = std::io::copy(&mut std::io::repeat(7), &mut file).unwrap_err();
+        assert_eq!(full.kind(), std::io::ErrorKind::StorageFull);
+        // For a stream of answers there is room, and for less than a tile.
+        file.set_len(file.metadata().unwrap().len() - (96 << 10)).unwrap();
+        let body: Vec<u8> = tiling(SIZE, 48).flat_map(|core| tile(SIZE, core, halo)).collect();
+        let lines = server.post("/v1/images/a/tiles", &body).lines();
+        let refused = lines.iter().filter(|line| line["problem"]["code"] == "disk_full").count();
+        assert!(refused > 0, "{lines:?}");
+        assert_eq!(lines.last().unwrap()["errors"], refused, "{lines:?}");
+        // Without even that, none begins; what the answer took may be free a little later.
+        wait_for("all of it to be taken", || {
+            let _ = std::io::copy(&mut std::io::repeat(7), &mut file);
+            let answer = server.post("/v1/images/a/tiles", &body);
+            answer.status != 200 && answer.problem(507, "disk_full").is_object()
+        });
+        server.post("/v1/images", br#"{"width": 16, "height": 16, "id": "b"}"#).problem(507, "disk_full");
+        server.get("/readyz").problem(503, "low_disk");
+        std::fs::remove_file(&ballast).unwrap();
+        drop(file);
+        let lines = server.post("/v1/images/a/tiles", &body).lines();
+        assert_eq!(lines.last().unwrap()["errors"], 0, "{lines:?}");
+        wait_for("the image", || server.get("/v1/images/a").json()["complete"] == true);
+        assert!(server.get("/v1/images/a/result.exr").body == expected);
+        server.get("/v1/images/b").problem(404, "unknown_image");
     }
 }
 

@@ -227,7 +227,8 @@ impl Folder for Lossy {
 const SIZE: [u32; 2] = [48, 40];
 
 fn description(method: &Method, neighbors: Option<Announced>) -> Description {
-    let description = Description { size: SIZE, method: method.clone(), seed: 5, leave_out: true, neighbors, disk: 0 };
+    let description =
+        Description { size: SIZE, method: method.clone(), seed: 5, leave_out: true, neighbors, owner: None, disk: 0 };
     Description { disk: disk_bytes(&description), ..description }
 }
 
@@ -349,6 +350,7 @@ fn lose_samples(few: u64, kinds: impl Fn(Rect) -> Vec<SampleTile>) -> usize {
     let cores: Vec<Rect> = tiling(SIZE, 16).collect();
     let tiles: Vec<Vec<SampleTile>> = cores.iter().map(|&core| kinds(core)).collect();
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let execution = Execution { pool: Some(&pool), ..Execution::default() };
     let (mut losses, mut provisional) = (0, 0);
     for seed in rounds(few) {
         let mut random = Random::new(seed);
@@ -380,8 +382,8 @@ fn lose_samples(few: u64, kinds: impl Fn(Rect) -> Vec<SampleTile>) -> usize {
                 if random.below(2) == 0 && image.flush().is_ok() {
                     waiting.drain(..).for_each(|i| acknowledged[i] = true);
                 }
-                while let Ok(Some(job)) = image.next_job(1, u64::MAX) {
-                    if image.run(&job, &pool).is_err() {
+                while let Ok(Some(job)) = image.next_job(1, u64::MAX, u64::MAX) {
+                    if image.run(&job, &execution).is_err() {
                         break;
                     }
                 }
@@ -391,8 +393,8 @@ fn lose_samples(few: u64, kinds: impl Fn(Rect) -> Vec<SampleTile>) -> usize {
                 provisional += (0..regions.count()).filter(lent).count();
             }
             if image.flush().is_ok() {
-                while let Ok(Some(job)) = image.next_job(1, u64::MAX) {
-                    let _ = image.run(&job, &pool);
+                while let Ok(Some(job)) = image.next_job(1, u64::MAX, u64::MAX) {
+                    let _ = image.run(&job, &execution);
                     if disk.failed() {
                         break;
                     }

@@ -5,6 +5,7 @@ use crate::{
     cli::{rpfd, stderr},
     wire::interop::run_python,
 };
+use rpfd::config::{ByteSize, Config};
 use std::{
     collections::BTreeSet,
     path::{Path, PathBuf},
@@ -138,6 +139,40 @@ fn the_manifests_fit_their_schemas() {
     if let Some(output) = run_python("yaml", "-c".as_ref(), &arguments) {
         assert!(output.status.success() && String::from_utf8(output.stdout).unwrap().trim() == paths.len().to_string());
     }
+}
+
+/// The value of a setting where it is put like this.
+fn value(path: &str, before: &str) -> ByteSize {
+    let text = std::fs::read_to_string(deploy().join(path)).unwrap();
+    let rest = text.split(before).nth(1).unwrap_or_else(|| panic!("{path}: no {before}"));
+    let word = rest.trim_start().split(['"', '}', '\n']).next().unwrap().trim();
+    // Kubernetes, Docker and systemd write units like this.
+    let unit = word.trim_start_matches(|c: char| c.is_ascii_digit()).to_uppercase();
+    let unit = if ["M", "G", "MI", "GI"].contains(&&*unit) { format!("{}iB", &unit[..1]) } else { String::new() };
+    let number = word.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    if unit.is_empty() { word.parse().unwrap() } else { format!("{number}{unit}").parse().unwrap() }
+}
+
+#[test]
+fn there_is_as_much_memory_and_disk_as_the_service_is_told() {
+    for (memory, limit) in [
+        (value("kubernetes/rpfd.yaml", "RPFD_MEMORY, value:"), value("kubernetes/rpfd.yaml", "limits: {memory:")),
+        (value("compose.yaml", "RPFD_MEMORY:"), value("compose.yaml", "mem_limit:")),
+        (value("rpfd.toml", "memory = \""), value("systemd/rpfd.service", "MemoryMax=")),
+    ] {
+        assert!(memory.0 + (64 << 20) < limit.0, "{memory} {limit}");
+    }
+    let default = Config::default();
+    let beside = default.unread_results.0 + default.disk_reserve.0;
+    let (disk, volume) =
+        (value("kubernetes/rpfd.yaml", "RPFD_DISK, value:"), value("kubernetes/rpfd.yaml", "requests: {storage:"));
+    // A file system keeps a twentieth.
+    assert!(disk.0 + beside < volume.0 / 20 * 19, "{disk} {volume}");
+    // And most of the volume is of use.
+    assert!(disk.0 > volume.0 / 5 * 4, "{disk} {volume}");
+    let told = |name: &str| value("rpfd.toml", &format!("\n{name} = \""));
+    assert_eq!((told("unread_results"), told("disk_reserve")), (default.unread_results, default.disk_reserve));
+    assert_eq!((told("disk"), value("compose.yaml", "RPFD_DISK:")), (default.disk, default.disk));
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! What an image has survives: kills, new starts, damaged files, a full disk. Images end when nobody uses them.
 
-use super::{Server, encode, neighbors, samples, tile, wait_for};
-use rpfd::filter::Rect;
+use super::{Server, encode, exact::whole_exr, neighbors, samples, tile, wait_for};
+use rpfd::filter::{Method, Rect};
 use serde_json::json;
 use std::process::Command;
 
@@ -146,6 +146,39 @@ fn a_damaged_file_is_named_and_leaves_other_images_alone() {
     }
     open(&server, "state");
     assert_eq!(send(&server, "state", LEFT), "filtered");
+}
+
+#[test]
+fn images_that_nobody_uses_leave_the_memory_and_come_back() {
+    let server = Server::start(&["--metrics-listen", "127.0.0.1:0", "--image-idle", "100ms"]);
+    let whole = samples(SIZE, Rect::new(0, 0, 32, 16), 0, 1);
+    let expected = whole_exr(&whole, &Method::preset("lean").unwrap(), 5);
+    open(&server, "a");
+    let (opening, id) = (neighbors::opening("b", SIZE, "lean", ("samples", 4)), "b");
+    assert_eq!(server.post("/v1/images", &opening).status, 201);
+    let bare = |core| server.post("/v1/images/b/tiles", &tile(SIZE, core, 0)).lines()[0]["state"].clone();
+    let asleep = || {
+        wait_for("the images to leave the memory", || server.metric("rpfd_images_in_memory") == Some(0.0));
+        let open = std::fs::read_dir(format!("/proc/{}/fd", server.pid())).unwrap();
+        let open = open.filter_map(|fd| std::fs::read_link(fd.unwrap().path()).ok());
+        let of_images: Vec<_> = open.filter(|path| path.starts_with(server.data_dir().join("images"))).collect();
+        assert!(of_images.is_empty(), "{of_images:?}");
+        assert_eq!(server.metric("rpfd_images_open"), Some(2.0));
+    };
+    asleep();
+    assert_eq!((send(&server, "a", LEFT), bare(LEFT)), ("filtered".into(), json!("stored")));
+    asleep();
+    // What is known of them without opening them is what is known of them.
+    let list = server.get("/v1/images").json();
+    assert_eq!((&list["images"][0]["pixels_done"], &list["images"][1]["tiles_stored"]), (&json!(256), &json!(1)));
+    assert_eq!(server.metric("rpfd_images_in_memory"), Some(0.0));
+    assert_eq!((send(&server, "a", LEFT), bare(LEFT)), ("repeated".into(), json!("repeated")));
+    asleep();
+    assert_eq!((send(&server, "a", RIGHT), bare(RIGHT)), ("filtered".into(), json!("stored")));
+    neighbors::wait_complete(&server, id);
+    asleep();
+    assert!(server.get("/v1/images/b/result.exr").body == expected);
+    assert_eq!(server.get("/v1/images/a/result.exr").status, 200);
 }
 
 #[test]

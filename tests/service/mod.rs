@@ -1,5 +1,6 @@
 //! The service over HTTP: the real binary on a free port.
 
+mod answers;
 mod bad_input;
 mod clients;
 mod codes;
@@ -16,6 +17,7 @@ pub(crate) mod neighbors;
 mod observe;
 mod openapi;
 mod proxy;
+mod recovering;
 mod stop;
 mod tokens;
 
@@ -55,10 +57,19 @@ impl Server {
         Self::start_by(command, tempfile::tempdir().unwrap(), arguments)
     }
 
-    /// One that finds what was in its data folder before.
+    /// One that finds what was in its data folder before, and knows it.
     pub(crate) fn start_in(folder: tempfile::TempDir, arguments: &[&str]) -> Self {
-        let command = Command::new(env!("CARGO_BIN_EXE_rpfd"));
-        Self::start_by(command, folder, arguments)
+        let server = Self::start_by(Command::new(env!("CARGO_BIN_EXE_rpfd")), folder, arguments);
+        server.wait_recovered();
+        server
+    }
+
+    /// Waits until it knows the images that were there.
+    pub(crate) fn wait_recovered(&self) {
+        wait_for("the images to be recovered", || {
+            let ready = self.get("/readyz");
+            ready.status == 200 || ready.json()["code"] != "recovering"
+        });
     }
 
     /// One that is started by another program, whose arguments it follows.

@@ -3,15 +3,19 @@
 use super::{Server, contradicting, encode, exact::whole_exr, samples, tile, wait_for};
 use crate::stitch::shuffle;
 use rpfd::{
+    disk::Directory,
     filter::{Execution, Method, Rect, SampleTile, TileGeometry, filter, geometry::tiling},
-    image::description::channels_to_json,
+    image::{Announced, Description, Image, ImageError, description::channels_to_json},
     stitch::exr,
     store::Spool,
     synth::Scene,
     wire::{Decoder, Event},
 };
 use serde_json::{Value, json};
-use std::os::unix::fs::MetadataExt;
+use std::{
+    os::unix::fs::MetadataExt,
+    sync::{Arc, atomic::AtomicBool},
+};
 
 /// What opens an image of this scene's tiles.
 pub(crate) fn opening(id: &str, size: [u32; 2], preset: &str, samples: (&str, u32)) -> Vec<u8> {
@@ -342,6 +346,73 @@ fn an_image_is_finished_with_what_halos_brought() {
     let tiles = [samples(SIZE, core, 0, 1)];
     assert!(exr == partial(SIZE, &tiles, &strips, &method), "the halo was not used");
     assert!(exr != partial(SIZE, &tiles, &[], &method), "the halo makes no difference");
+}
+
+#[test]
+fn a_region_that_takes_too_long_is_stopped() {
+    // A minute of work on one thread.
+    const SIZE: [u32; 2] = [48, 48];
+    let server = Server::start(&["--metrics-listen", "127.0.0.1:0", "--work-deadline", "50ms"]);
+    let mut opening: Value = serde_json::from_slice(&opening("a", SIZE, "paper", ("samples", 4))).unwrap();
+    opening["boxes"] = json!([55, 55, 55, 55]);
+    opening["fractions"] = json!([4, 4, 4, 4]);
+    assert_eq!(server.post("/v1/images", opening.to_string().as_bytes()).status, 201);
+    server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(0, 0, 48, 48), 0)).lines();
+    let trouble = || server.get("/v1/images/a").json()["trouble"].clone();
+    wait_for("the time to be up", || trouble()["code"] == "work_timeout");
+    assert!(trouble()["detail"].as_str().unwrap().contains("smaller parts"), "{}", trouble());
+    wait_for("its memory to be free", || server.metric("rpfd_memory_used_bytes") == Some(0.0));
+    assert!(server.metric("rpfd_regions_total{outcome=\"failed\"}") >= Some(1.0));
+    // It is tried again, until the image is forgotten.
+    wait_for("another attempt", || server.metric("rpfd_regions_total{outcome=\"failed\"}") >= Some(2.0));
+    assert_eq!(server.call("DELETE", "/v1/images/a", &[], &[]).status, 204);
+    wait_for("the work to end", || server.metric("rpfd_images_disk_bytes") == Some(0.0));
+}
+
+#[test]
+fn a_region_that_was_stopped_is_filtered_in_parts() {
+    const SIZE: [u32; 2] = [64, 48];
+    let (folder, method) = (tempfile::tempdir().unwrap(), Method::preset("lean").unwrap());
+    let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
+    let announced = Announced { channels: whole.channels().clone(), samples: 4, varying: false, region: 64 };
+    let neighbors = Some(announced);
+    let description =
+        Description { size: SIZE, method: method.clone(), seed: 5, leave_out: true, neighbors, owner: None, disk: 0 };
+    Image::create(&Directory::new(folder.path()), &description).unwrap();
+    let image = Arc::new(Image::open(Box::new(Directory::new(folder.path()))).unwrap());
+    image.offer(&whole, false).unwrap();
+    image.flush().unwrap();
+    let stop = AtomicBool::new(true);
+    let stopped = Execution { stop: Some(&stop), ..Execution::default() };
+    let job = image.next_job(1, u64::MAX, u64::MAX).unwrap().unwrap();
+    assert!(matches!(image.run(&job, &stopped), Err(ImageError::Stopped(_))));
+    assert_eq!(job.pixels, 64 * 48);
+    let part = image.next_job(1, u64::MAX, job.pixels / 3).unwrap().unwrap();
+    assert_eq!(part.pixels, 32 * 24);
+    let spent = image.run(&part, &Execution::default()).unwrap();
+    assert!(!spent.filter.is_zero() && !spent.read.is_zero() && !spent.write.is_zero());
+    let inner = image.read();
+    assert!(inner.stitcher().tiles().count() == 4 && inner.stitcher().is_complete());
+    let mut out = std::io::Cursor::new(Vec::new());
+    let attributes = exr::provenance(method.preset_name(), 5, method.parameters());
+    let options = rpfd::stitch::ExrOptions { attributes, ..Default::default() };
+    inner.stitcher().encode_exr(&options, false, &mut out).unwrap();
+    assert!(out.into_inner() == whole_exr(&whole, &method, 5));
+}
+
+#[test]
+fn regions_take_no_places_of_tiles_in_the_queue() {
+    const SIZE: [u32; 2] = [256, 192];
+    let metrics = ["--metrics-listen", "127.0.0.1:0", "--threads", "2"];
+    let server = Server::start(&[&metrics[..], &["--memory", "32MiB", "--queue", "1"]].concat());
+    open(&server, SIZE, "lean");
+    // One tile after another waits, and so do regions at the same time.
+    let body: Vec<u8> = tiling(SIZE, 32).flat_map(|core| tile(SIZE, core, 0)).collect();
+    let lines = server.post("/v1/images/a/tiles", &body).lines();
+    assert_eq!(lines.last().unwrap(), &json!({ "state": "end", "tiles": 48, "errors": 0 }));
+    wait_complete(&server, "a");
+    assert_eq!(server.metric("rpfd_problems_total{code=\"busy\"}"), None);
+    assert_eq!(server.metric("rpfd_regions_total{outcome=\"failed\"}"), Some(0.0));
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! What an operator sees: metrics, the log, request ids.
 
-use super::{Server, head, tile, whole};
+use super::{Server, head, neighbors, tile, whole};
 use crate::wire::interop::run_python;
 use rpfd::filter::Rect;
 use serde_json::Value;
@@ -25,6 +25,7 @@ fn what_happens_is_counted() {
         ("rpfd_tiles_total{outcome=\"failed\"}", 1.0),
         ("rpfd_tile_phase_seconds_count{phase=\"queue\"}", 6.0),
         ("rpfd_tile_phase_seconds_count{phase=\"receive\"}", 6.0),
+        ("rpfd_tile_phase_seconds_count{phase=\"turn\"}", 6.0),
         ("rpfd_tile_phase_seconds_count{phase=\"filter\"}", 4.0),
         ("rpfd_tile_phase_seconds_count{phase=\"write\"}", 4.0),
         ("rpfd_requests_total{route=\"/v1/images/{id}\",method=\"GET\",status=\"404\"}", 1.0),
@@ -44,6 +45,36 @@ fn what_happens_is_counted() {
     assert!(server.metric("rpfd_disk_size_bytes") >= server.metric("rpfd_disk_free_bytes"));
     // Nothing of it is served where the work is done.
     server.get("/metrics").problem(404, "not_found");
+}
+
+#[test]
+fn regions_and_disk_are_counted() {
+    let server = Server::start(&[&METRICS[..], &["--disk", "3GiB"]].concat());
+    let limit = server.metric("rpfd_images_disk_limit_bytes");
+    assert_eq!((limit, server.metric("rpfd_images_disk_bytes")), (Some(f64::from(3 << 29) * 2.0), Some(0.0)));
+    let opened = server.post("/v1/images", &neighbors::opening("a", [128, 64], "lean", ("samples", 4))).json();
+    assert_eq!(server.metric("rpfd_images_disk_bytes"), opened["disk"].as_f64());
+    let cores = [Rect::new(0, 0, 64, 64), Rect::new(64, 0, 64, 64)];
+    let body: Vec<u8> = cores.iter().flat_map(|&core| tile([128, 64], core, 0)).collect();
+    assert_eq!(server.post("/v1/images/a/tiles", &body).lines().len(), 3);
+    neighbors::wait_complete(&server, "a");
+    let regions = opened["regions"].as_f64().unwrap();
+    for (name, value) in [
+        ("rpfd_regions_total{outcome=\"filtered\"}", regions),
+        ("rpfd_regions_total{outcome=\"failed\"}", 0.0),
+        ("rpfd_tiles_total{outcome=\"stored\"}", 2.0),
+        // Tiles and regions wait, and are read; regions alone are filtered.
+        ("rpfd_tile_phase_seconds_count{phase=\"queue\"}", 2.0 + regions),
+        ("rpfd_tile_phase_seconds_count{phase=\"receive\"}", 2.0 + regions),
+        ("rpfd_tile_phase_seconds_count{phase=\"turn\"}", 2.0 + regions),
+        ("rpfd_tile_phase_seconds_count{phase=\"filter\"}", regions),
+        ("rpfd_tile_phase_seconds_count{phase=\"write\"}", regions),
+        ("rpfd_queue_length", 0.0),
+    ] {
+        super::wait_until(name, || server.metric(name) == Some(value));
+    }
+    assert_eq!(server.call("DELETE", "/v1/images/a", &[], &[]).status, 204);
+    super::wait_until("the disk is free", || server.metric("rpfd_images_disk_bytes") == Some(0.0));
 }
 
 /// Series, without their values.

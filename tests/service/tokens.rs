@@ -134,6 +134,41 @@ fn the_python_client_sends_a_token() {
 }
 
 #[test]
+fn images_of_one_token_are_limited() {
+    let folder = Folder::new();
+    let (file, mut tokens) = tokens(&folder, &[("a", "submit,read"), ("b", "submit,read")]);
+    let output = rpfd(["token", "few", "--images", "1", "--secret", &folder.path("few.token")]);
+    let entry = String::from_utf8(output.stdout).unwrap();
+    assert!(entry.contains("images = 1\n"), "{entry}");
+    std::fs::write(&file, std::fs::read_to_string(&file).unwrap() + &entry).unwrap();
+    tokens.push(std::fs::read_to_string(folder.path("few.token")).unwrap().trim().to_owned());
+    let arguments = ["--token-file", &file, "--token-images", "2", "--images", "4"];
+    let mut server = Server::start(&arguments);
+    let open = |server: &Server, token: usize, id: &str| {
+        let body = format!(r#"{{"width": 8, "height": 8, "id": "{id}"}}"#);
+        server.call("POST", "/v1/images", &[&bearer(&tokens[token])], body.as_bytes())
+    };
+    assert_eq!((open(&server, 0, "a1").status, open(&server, 0, "a2").status), (201, 201));
+    for _ in 0..2 {
+        let refused = open(&server, 0, "a3");
+        let problem = refused.problem(429, "image_quota");
+        assert!(problem["detail"].as_str().unwrap().contains("2 images"), "{problem}");
+        assert_eq!(refused.header("retry-after"), Some("60"));
+        // What is open already is; whoever opened it.
+        assert_eq!((open(&server, 0, "a1").status, open(&server, 1, "a1").status), (200, 200));
+        // Whose they are is known after a new start.
+        server = Server::start_in(server.kill(), &arguments);
+    }
+    assert_eq!(open(&server, 2, "few1").status, 201);
+    open(&server, 2, "few2").problem(429, "image_quota");
+    // Others have room, until all of it is taken; one's own is free again after an image.
+    assert_eq!(open(&server, 1, "b1").status, 201);
+    open(&server, 1, "b2").problem(503, "too_many_images");
+    let delete = server.call("DELETE", "/v1/images/a2", &[&bearer(&tokens[1])], &[]);
+    assert_eq!((delete.status, open(&server, 0, "a3").status), (204, 201));
+}
+
+#[test]
 fn requests_at_once_are_limited() {
     let folder = Folder::new();
     let (file, tokens) = tokens(&folder, &[("a", "submit"), ("b", "submit,read")]);

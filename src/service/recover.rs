@@ -1,0 +1,117 @@
+//! What the data folder holds is read anew when the service starts; meanwhile it answers already, but for calls about
+//! images.
+
+use std::{
+    fs, io,
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::{Instant, UNIX_EPOCH},
+};
+
+use axum::{
+    extract::{Request, State},
+    middleware::Next,
+    response::Response,
+};
+use serde_json::Value;
+
+use super::{
+    Shared,
+    health::{Reason, recovering},
+    problem::Refusal,
+    regions,
+    registry::{Entry, Id, Images, Opened, Slot, now, remove},
+    work::blocking,
+};
+use crate::{
+    disk::Directory,
+    image::{self, Image},
+};
+
+/// Recovers what was found in the data folder, one after another, and goes on with what can be filtered.
+pub(super) async fn recover(service: Shared, found: Vec<PathBuf>) {
+    let (began, count) = (Instant::now(), found.len());
+    for path in found {
+        // It is all there at the next start too.
+        if service.readiness.has(Reason::Draining) {
+            return;
+        }
+        let shared = Arc::clone(&service);
+        // One that panics keeps no others from being recovered.
+        if let Ok(Some(opened)) = blocking(move || shared.images.recover(&path)).await {
+            regions::kick(&service, &opened);
+        }
+    }
+    service.readiness.set(Reason::Recovering, false);
+    if count > 0 {
+        tracing::info!(images = service.images.count(), seconds = began.elapsed().as_secs_f64(), "images recovered");
+    }
+}
+
+/// Lets calls about images in once all are known.
+pub(super) async fn recovered(
+    State(service): State<Shared>,
+    request: Request,
+    next: Next,
+) -> Result<Response, Refusal> {
+    if service.readiness.has(Reason::Recovering) {
+        return Err(recovering());
+    }
+    Ok(next.run(request).await)
+}
+
+impl Images {
+    /// Opens the image that is there, and removes the remains of what was not finished. Gives the image if there is
+    /// something to be filtered. Blocks.
+    fn recover(&self, path: &Path) -> Option<Opened> {
+        let Some(id) = path.file_name().and_then(|name| name.to_str()).and_then(Id::chosen) else {
+            // An image that was just being made, or removed.
+            if let Err(error) = remove(path) {
+                tracing::error!(path = %path.display(), %error, "remains cannot be removed");
+            }
+            return None;
+        };
+        let touched =
+            fs::metadata(path.join(image::TOUCHED)).or_else(|_| fs::metadata(path)).and_then(|m| m.modified());
+        let touched =
+            touched.ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok()).map_or_else(now, |t| t.as_secs());
+        let opened = tidy(path).map_err(image::ImageError::from);
+        let (owner, disk, slot) = match opened.and_then(|()| Image::open(Box::new(Directory::new(path)))) {
+            Ok(image) => {
+                let (description, summary) = (image.description().clone(), super::images::summary(&id, &image));
+                // What can go on is kept open.
+                let waits = image.read().regions().is_some_and(|regions| regions.open() > 0);
+                let slot = if waits { Slot::Open(Arc::new(image)) } else { Slot::Closed(summary) };
+                (description.owner, description.disk, slot)
+            }
+            Err(error) => {
+                tracing::error!(id = id.0, %error, "an image cannot be opened");
+                let damaged = error.is_damage();
+                let slot = if damaged { Slot::Damaged(error.to_string()) } else { Slot::Closed(Value::Null) };
+                (None, used(path), slot)
+            }
+        };
+        let image = if let Slot::Open(image) = &slot { Some(Arc::clone(image)) } else { None };
+        let entry = Arc::new(Entry::new(id.clone(), owner, disk, touched, slot));
+        self.lock().insert(id, Arc::clone(&entry));
+        image.map(|image| Opened { entry, image })
+    }
+}
+
+/// Removes what does not belong into an image's folder.
+fn tidy(path: &Path) -> io::Result<()> {
+    for found in fs::read_dir(path)? {
+        let found = found?;
+        if found.file_name().to_str().is_none_or(|name| !image::FILES.contains(&name)) {
+            remove(&found.path())?;
+        }
+    }
+    Ok(())
+}
+
+/// Bytes of disk that the files of a folder take.
+fn used(path: &Path) -> u64 {
+    use std::os::unix::fs::MetadataExt;
+    let files = fs::read_dir(path).into_iter().flatten().flatten();
+    files.filter_map(|file| Some(file.metadata().ok()?.blocks() * 512)).sum()
+}
