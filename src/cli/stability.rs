@@ -150,7 +150,7 @@ fn print_table(results: &[(&Case, Method, Outcome)]) {
     for (case, method, outcome) in results {
         if outcome.verdict == Verdict::Failed {
             say!("\n{} with {} is beyond its bounds: {}", case.name, method.preset_name(), outcome.beyond.join("; "));
-            say!("  bounds: {}", case.bounds.reason);
+            say!("  bounds: {}", case.bounds_of(method).reason);
         } else if let (Verdict::Known, Some(cause)) = (outcome.verdict, case.known_cause(method)) {
             let names = known.entry(cause).or_default();
             if names.last() != Some(&case.name.as_str()) {
@@ -172,7 +172,7 @@ fn short(value: f64) -> String {
 fn to_json(case: &Case, method: &Method, outcome: &Outcome) -> Value {
     let deviation = |d: Deviation| json!({ "median": d.median, "rms": d.rms, "greatest": d.greatest });
     let Outcome { steps, .. } = outcome;
-    let bounds = &case.bounds;
+    let bounds = case.bounds_of(method);
     json!({
         "case": case.name,
         "preset": method.preset_name(),
@@ -194,7 +194,7 @@ fn to_json(case: &Case, method: &Method, outcome: &Outcome) -> Value {
         "oracle_energy": outcome.oracle_energy,
         "bounds": {
             "step": bounds.step, "step_rms": bounds.step_rms, "differently": bounds.differently, "whole": bounds.whole.is_finite().then_some(bounds.whole),
-            "whole_median": bounds.whole_median,
+            "whole_median": bounds.whole_median.is_finite().then_some(bounds.whole_median),
             "clean": outcome.clean_bound.map(|(field, bound)| json!({ "field": field, "bound": bound })),
             "energy": bounds.energy.map(|e| e.is_finite().then_some(e)),
             "reason": bounds.reason,

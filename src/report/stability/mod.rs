@@ -128,12 +128,14 @@ pub struct Case {
     pub base: Base,
     /// How the image is brought back.
     pub back: Back,
-    /// What is asked of it.
-    pub bounds: Bounds,
+    /// What is asked of it; see [`Case::bounds_of`].
+    bounds: Bounds,
     /// Why the published algorithm is known to miss the bounds of the clean case and of energy, if it is.
     known: Option<&'static str>,
     /// Why the baselines are, if any is.
     known_of_baselines: Option<&'static str>,
+    /// RMS and median deviation of the whole that baselines may have, where that is not what RPF may.
+    whole_of_baselines: Option<[f64; 2]>,
     /// Parameters set in every preset.
     settings: Vec<(&'static str, &'static str)>,
     /// The samples come over the wire in half precision.
@@ -156,6 +158,7 @@ impl Case {
             bounds,
             known: None,
             known_of_baselines: None,
+            whole_of_baselines: None,
             settings: Vec::new(),
             f16: false,
             change,
@@ -172,6 +175,10 @@ impl Case {
 
     fn known_of_baselines(self, known: &'static str) -> Self {
         Self { known_of_baselines: Some(known), ..self }
+    }
+
+    fn whole_of_baselines(self, rms: f64, median: f64) -> Self {
+        Self { whole_of_baselines: Some([rms, median]), ..self }
     }
 
     fn over_the_wire_as_f16(self) -> Self {
@@ -197,6 +204,14 @@ impl Case {
         let smaller: &[_] = if preset == "paper" { &[("boxes", "15,9,5"), ("fractions", "0.5,0.5,0.5")] } else { &[] };
         let settings = self.settings.iter().filter(|(name, _)| has.iter().any(|(known, _)| known == name));
         Method::with(preset, smaller.iter().chain(settings).copied())
+    }
+
+    /// What is asked of a method.
+    pub fn bounds_of(&self, method: &Method) -> Bounds {
+        match (method.algorithm(), self.whole_of_baselines) {
+            (Algorithm::Rpf(_), _) | (_, None) => self.bounds.clone(),
+            (_, Some([whole, whole_median])) => Bounds { whole, whole_median, ..self.bounds.clone() },
+        }
     }
 
     /// Why a method is known to miss the bounds of the clean case and of energy, if it is.
