@@ -387,7 +387,7 @@ mod tests {
         let far = Some(Deviation { rms: 9.0, ..Deviation::default() });
         let verdict = |clean, oracle_clean, steps: Steps, may_be_known| {
             let mut outcome = Outcome { clean, oracle_clean, steps, ..good.clone() };
-            outcome.judge(&case.bounds_of(method), may_be_known);
+            outcome.judge(&case.bounds, may_be_known);
             (outcome.verdict, outcome.beyond.len())
         };
         assert_eq!(verdict(good.clean, good.oracle_clean, good.steps, true), (Verdict::Ok, 0));
