@@ -70,20 +70,19 @@ pub fn page(page: &Page) -> String {
     }
     out += "<h2>Numbers</h2>\n";
     numbers(&mut out, page);
-    let tables = [
-        ("With and without a tolerance", table::tolerances(page.rows), table::TOLERANCE_NOTE),
-        ("Left out", table::left_out(page.rows), table::LEFT_OUT_NOTE),
-    ];
-    for (title, (headings, cells), note) in tables.iter().filter(|(_, (_, cells), _)| !cells.is_empty()) {
+    for (title, (headings, cells), note) in table::others(page.rows) {
         let _ = writeln!(out, "<h2>{title}</h2>\n<p class=\"note\">{}</p>", escape(note));
         let rows: Vec<_> = cells.iter().map(|cells| ("", &cells[..])).collect();
-        lay_out(&mut out, headings, &rows);
+        lay_out(&mut out, &headings, &rows);
     }
     out += "<h2>Pictures</h2>\n<p class=\"note\">The middle of each image at its most samples, at most 64 x 64 pixels, each \
             drawn twice as large: sRGB, exposure 0, clipped. A difference is |x - r|, shown the same way.</p>\n";
     pictures(&mut out, page);
-    out += "<h2>Formulas</h2>\n<p>x is the filtered image, r the reference, both linear RGB; means are over pixels and \
-            channels.</p>\n<div class=\"wide\"><table class=\"formulas\">\n";
+    let _ = writeln!(
+        out,
+        "<h2>Formulas</h2>\n<p>{}</p>\n<div class=\"wide\"><table class=\"formulas\">",
+        escape(table::FORMULAS_NOTE)
+    );
     for column in COLUMNS {
         let _ = writeln!(out, "<tr><th>{}</th><td>{}</td></tr>", escape(column.title), escape(column.formula));
     }
@@ -136,14 +135,8 @@ fn numbers(out: &mut String, page: &Page) {
     let rows: Vec<_> = page.rows.iter().zip(&cells).map(|(row, cells)| (class(row), &cells[..])).collect();
     lay_out(out, &headings, &rows);
     *out += "<ul class=\"note\">\n";
-    let notes = &table::NOTES[..if page.seconds_per_sample.is_some() { 6 } else { 5 }];
+    let notes = table::notes(page.rows, page.seconds_per_sample);
     notes.iter().for_each(|note| *out += &format!("<li>{}</li>\n", escape(note)));
-    if let Some(seconds) = page.seconds_per_sample {
-        let _ = writeln!(
-            out,
-            "<li>To render one sample per pixel is taken to cost {seconds} CPU s per megapixel: given, not measured.</li>"
-        );
-    }
     let mut seen = Vec::new();
     for row in page.rows {
         let data = &row.key.data;
@@ -161,14 +154,6 @@ fn numbers(out: &mut String, page: &Page) {
             "<li>{}: {width} x {height} pixels from ({x}, {y}); {own}; unfiltered slope {:.3}</li>",
             escape(data),
             row.slope.value()
-        );
-    }
-    for row in page.rows.iter().filter(|row| !row.repeatable) {
-        let _ = writeln!(
-            out,
-            "<li>NOT REPEATABLE: the errors of {} on {} differ between repeats</li>",
-            escape(&row.label),
-            escape(&row.key.data)
         );
     }
     *out += "</ul>\n";

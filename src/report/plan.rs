@@ -29,6 +29,9 @@ pub struct Key {
     /// SIMD level that they used.
     #[serde(default)]
     pub simd: String,
+    /// What the processor calls itself: times of another are not this one's.
+    #[serde(default)]
+    pub cpu: String,
     /// Keys the method's random draws.
     pub seed: u64,
     /// 0 for the first time the same is measured.

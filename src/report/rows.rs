@@ -223,6 +223,7 @@ mod tests {
             parameters: Vec::new(),
             threads: 1,
             simd: "any".into(),
+            cpu: "any".into(),
             seed: 0,
             repeat,
             version: "0".into(),

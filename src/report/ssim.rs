@@ -100,6 +100,15 @@ mod tests {
         }
     }
 
+    /// scikit-image 0.26, `structural_similarity` of the luminances with gaussian_weights=True, sigma=1.5,
+    /// use_sample_covariance=False, data_range=1.
+    #[test]
+    fn as_scikit_image() {
+        let (a, b) = (image(23, 17, 5), image(23, 17, 91));
+        let got = ssim(&a, &b, 23);
+        assert!((got - 0.058_365_405_539_560_4).abs() < 1e-10, "{got}");
+    }
+
     /// Two flat images: only the luminance term is left.
     #[test]
     fn flat_images_have_a_closed_form() {

@@ -36,8 +36,11 @@ fn mebibytes(bytes: u64) -> String {
     short(bytes as f64 / f64::from(1 << 20))
 }
 
+/// Headings, and rows of as many cells.
+pub type Table = (Vec<&'static str>, Vec<Vec<String>>);
+
 /// The headings and cells to read; `seconds_per_sample` is what a sample per pixel takes to render, per megapixel.
-pub fn cells(rows: &[Row], seconds_per_sample: Option<f64>) -> (Vec<&'static str>, Vec<Vec<String>>) {
+pub fn cells(rows: &[Row], seconds_per_sample: Option<f64>) -> Table {
     let mut headings = vec![
         "data set",
         "spp",
@@ -96,7 +99,7 @@ pub fn cells(rows: &[Row], seconds_per_sample: Option<f64>) -> (Vec<&'static str
 }
 
 /// A table of fixed-width text.
-pub fn text((headings, cells): &(Vec<&'static str>, Vec<Vec<String>>)) -> String {
+pub fn text((headings, cells): &Table) -> String {
     let width = |column: usize| {
         let widths = cells.iter().map(|row| row[column].chars().count());
         widths.chain([headings[column].chars().count()]).max().unwrap_or(0)
@@ -116,7 +119,7 @@ pub fn text((headings, cells): &(Vec<&'static str>, Vec<Vec<String>>)) -> String
 }
 
 /// What a tolerance gains and costs: headings, and a row of cells for each method that was measured with and without.
-pub fn tolerances(rows: &[Row]) -> (Vec<&'static str>, Vec<Vec<String>>) {
+fn tolerances(rows: &[Row]) -> Table {
     let headings = vec![
         "data set",
         "spp",
@@ -171,7 +174,7 @@ fn runs(planes: &[&str]) -> String {
 }
 
 /// What was left out: headings, and a row of cells for each data set and method that left out anything.
-pub fn left_out(rows: &[Row]) -> (Vec<&'static str>, Vec<Vec<String>>) {
+fn left_out(rows: &[Row]) -> Table {
     let mut cells: Vec<Vec<String>> = Vec::new();
     for row in rows.iter().filter(|row| !row.spared.planes.is_empty()) {
         let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
@@ -198,29 +201,66 @@ pub fn left_out(rows: &[Row]) -> (Vec<&'static str>, Vec<Vec<String>>) {
     (vec!["data set", "spp", "method", "work saved", "planes MiB", "planes"], cells)
 }
 
-/// What the headings of [`cells`] mean.
-pub const NOTES: [&str; 6] = [
+/// What stands beside the main table, where there is any of it: a title, the table, and what its headings mean.
+pub fn others(rows: &[Row]) -> impl Iterator<Item = (&'static str, Table, &'static str)> {
+    let all = [
+        ("With and without a tolerance", tolerances(rows), TOLERANCE_NOTE),
+        ("Left out", left_out(rows), LEFT_OUT_NOTE),
+    ];
+    all.into_iter().filter(|(_, (_, cells), _)| !cells.is_empty())
+}
+
+/// What the headings of [`cells`] mean, and what is to be said of these rows.
+pub fn notes(rows: &[Row], seconds_per_sample: Option<f64>) -> Vec<String> {
+    let mut notes = NOTES.map(str::to_owned).to_vec();
+    if let Some(seconds) = seconds_per_sample {
+        notes.push(format!(
+            "{TOTAL_NOTE} To render one sample per pixel is taken to cost {seconds} CPU s per megapixel: given, not measured."
+        ));
+    }
+    let unlike = rows.iter().filter(|row| !row.repeatable);
+    notes.extend(
+        unlike.map(|row| {
+            format!("NOT REPEATABLE: the errors of {} on {} differ between repeats", row.label, row.key.data)
+        }),
+    );
+    notes
+}
+
+const NOTES: [&str; 5] = [
     "relMSE and MSE are less the reference's own error where that is known; the trimmed relMSE is not.",
     "CPU and wall: seconds of the filter alone per megapixel (10^6 pixels), over all threads and by the clock; the median of \
      the repeats (least-greatest).",
     "plan: what the filter said it would need, samples included; peak: greatest resident size of the whole process meanwhile; \
      both in MiB (2^20 bytes), for the image as one tile.",
-    "front: no other method on the same data set, samples and threads has both less relMSE and less CPU time.",
+    "front: no other method on the same data set, samples and threads has as little relMSE in as little CPU time, and less \
+     of one.",
     "equal spp: plain samples per pixel whose mean would have the same relMSE, from the unfiltered error's slope: measured \
      where there are several sample counts, else -1.",
-    "total, plain: CPU seconds per megapixel to render the samples and filter them, and to render the plain samples of equal \
-     error; plain relMSE: that of as many plain samples as could be rendered in the total time.",
 ];
 
+const TOTAL_NOTE: &str = "total, plain: CPU seconds per megapixel to render the samples and filter them, and to render the plain samples of equal \
+     error; plain relMSE: that of as many plain samples as could be rendered in the total time.";
+
 /// What the headings of [`tolerances`] mean.
-pub const TOLERANCE_NOTE: &str = "settled: pixels that were passed through, since their own samples and those around them say \
+const TOLERANCE_NOTE: &str = "settled: pixels that were passed through, since their own samples and those around them say \
      that filtering can take less than the tolerance off their relMSE; estimated: what that adds to the image's relMSE at \
      most, on average; change: what it did add, with what other pixels draw from those that were passed through.";
 
 /// What the headings of [`left_out`] mean.
-pub const LEFT_OUT_NOTE: &str = "No bit of a result depends on it. work saved: of the filter's steps, by estimate; columns that are \
+const LEFT_OUT_NOTE: &str = "No bit of a result depends on it. work saved: of the filter's steps, by estimate; columns that are \
      constant over a neighbourhood only, and differences that weigh nothing, are counted as well. constant: equal in every \
      sample; missing: no sample has it; unused: the method does not look at it; equal: as an earlier colour plane.";
+
+/// What the errors are.
+pub fn formulas() -> String {
+    let lines = COLUMNS.iter().map(|column| format!("{}: {}\n", column.title, column.formula));
+    format!("{FORMULAS_NOTE}\n{}", lines.collect::<String>())
+}
+
+/// What the formulas are of.
+pub const FORMULAS_NOTE: &str =
+    "x is the filtered image, r the reference, both linear RGB; means are over pixels and channels.";
 
 /// All numbers with all their digits, one row on a line (RFC 4180). Empty is unknown.
 pub fn csv(rows: &[Row], seconds_per_sample: Option<f64>) -> String {

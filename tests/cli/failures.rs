@@ -142,3 +142,24 @@ fn a_reader_that_goes_is_no_failure() {
     assert!(output.status.success());
     assert_eq!(stderr(&output), "");
 }
+
+/// Whoever reads standard output may have seen enough, like `head`: that is no failure.
+#[test]
+fn nobody_has_to_read_to_the_end() {
+    let small = format!("{}={}", data("small.tiles.zst").display(), data("small.reference.exr").display());
+    let tiles = data("small.tiles.zst").display().to_string();
+    for args in [
+        &["stability", "--case", "image-1x1", "--preset", "lean"][..],
+        &["stability", "--case", "image-1x1", "--preset", "lean", "--json"],
+        &["report", "--data", &small, "--preset", "unfiltered"],
+        &["report", "--data", &small, "--preset", "unfiltered", "--json"],
+        &["inspect", &tiles],
+    ] {
+        let piped = std::process::Stdio::piped;
+        let mut child = Command::new(env!("CARGO_BIN_EXE_rpfd"));
+        let mut child = child.args(args).stdout(piped()).stderr(piped()).spawn().unwrap();
+        drop(child.stdout.take());
+        let output = child.wait_with_output().unwrap();
+        assert!(output.status.success(), "{args:?}: {}", stderr(&output));
+    }
+}

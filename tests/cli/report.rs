@@ -1,6 +1,7 @@
 //! `rpfd report`: errors that are the same whenever they are measured, and what is written about them.
 
 use super::*;
+use rpfd::report::{scores::COLUMNS, svg, table::short};
 use std::collections::BTreeMap;
 
 /// A crop of a render, with its reference.
@@ -59,6 +60,76 @@ fn errors_are_as_recorded_to_the_last_digit() {
     assert_eq!(error_columns(&one).lines().count(), golden.lines().count());
 }
 
+/// The committed report, by column.
+fn shared() -> Vec<BTreeMap<String, String>> {
+    let csv = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/report/shared.csv")).unwrap();
+    let columns = cells(csv.lines().next().unwrap());
+    csv.lines().skip(1).map(|line| columns.iter().cloned().zip(cells(line)).collect()).collect()
+}
+
+/// The README's table is the committed report's.
+#[test]
+fn the_readme_says_what_the_report_measured() {
+    let readme = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("README.md")).unwrap();
+    let rows = shared();
+    let relmse_at = |scene: &str, method: &str, spp: &str| -> f64 {
+        let of = |row: &&BTreeMap<String, String>| row["data"] == scene && row["spp"] == spp && row["method"] == method;
+        rows.iter().find(of).unwrap()["relmse_less_own"].parse().unwrap()
+    };
+    let relmse = |scene: &str, method: &str| relmse_at(scene, method, "8");
+    let scenes = ["cornell_box", "depth_of_field", "glossy_highlights", "motion_blur", "textures"];
+    for scene in scenes {
+        let line =
+            readme.lines().find(|line| line.starts_with(&format!("| {scene}, ")) && line.contains(" x ")).unwrap();
+        let said: Vec<_> = line.split('|').skip(2).map(|cell| cell.trim().replace('*', "")).collect();
+        let [before, lean, fast] = ["unfiltered", "lean", "paper-fast"].map(|method| relmse(scene, method));
+        let gain = |error: f64| match before / error {
+            gain if gain < 1.0 => format!("{gain:.2}"),
+            gain => format!("{gain:.1}"),
+        };
+        let [plain, lean_error, fast_error] = [before, lean, fast].map(|error| format!("{error:.4}"));
+        assert_eq!(said[..5], [plain, lean_error, gain(lean), fast_error, gain(fast)], "{line}");
+    }
+    let means = ["lean", "paper-fast", "cross-bilateral"].map(|method| {
+        let logs = scenes.map(|scene| (relmse(scene, "unfiltered") / relmse(scene, method)).ln());
+        (logs.iter().sum::<f64>() / logs.len() as f64).exp()
+    });
+    assert!(
+        readme.contains(&format!("| geometric mean | | | **{:.2}** | | **{:.2}** |", means[0], means[1])),
+        "{means:?}"
+    );
+    assert!(readme.contains(&format!("a geometric mean of {:.1}", means[2])), "{means:?}");
+    let more = ["4", "8", "32"].map(|spp| relmse_at("motion_blur", "lean", spp));
+    let said = format!("from {:.4} at 4 to {:.4} at 8\nand {:.4} at 32 samples", more[0], more[1], more[2]);
+    assert!(readme.contains(&said), "{said}");
+}
+
+/// The committed report is not older than the methods: its errors, to the last digit, on the renders that RPFD_DATA names.
+#[test]
+fn the_shared_report_is_as_committed() {
+    let Some(data) = std::env::var_os("RPFD_DATA") else {
+        return println!("SKIPPED: RPFD_DATA does not name a folder of renders with references");
+    };
+    let (folder, rows) = (Folder::new(), shared());
+    let csv = folder.path("now.csv");
+    let methods = ["lean", "cross-bilateral", "bilateral", "gaussian"];
+    let mut args: Vec<&OsStr> = vec!["report".as_ref(), "--csv".as_ref(), csv.as_ref(), "--folder".as_ref(), &data];
+    methods.iter().for_each(|method| args.extend(["--preset", *method].map(OsStr::new)));
+    let output = rpfd(args);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let now = std::fs::read_to_string(&csv).unwrap();
+    let columns = cells(now.lines().next().unwrap());
+    assert_eq!(now.lines().count(), 1 + 7 * 5);
+    for line in now.lines().skip(1).map(cells) {
+        let same = |row: &&BTreeMap<String, String>| (0..4).all(|i| row[&columns[i]] == line[i]);
+        let committed = rows.iter().find(same).unwrap_or_else(|| panic!("{:?} is not in shared.csv", &line[..4]));
+        let repeats = columns.iter().position(|name| name == "repeats").unwrap();
+        for (name, value) in columns.iter().zip(&line).take(repeats) {
+            assert_eq!(*value, committed[name], "{name} of {:?}: make tests/report again", &line[..4]);
+        }
+    }
+}
+
 #[test]
 fn threads_change_no_error() {
     let folder = Folder::new();
@@ -99,6 +170,28 @@ fn what_is_measured_is_not_measured_again() {
     assert_eq!(lines(&String::from_utf8(bytes(&state)).unwrap()), 30);
 }
 
+/// What was finished when the process was killed stays, and the rest is measured.
+#[test]
+fn a_killed_report_goes_on() {
+    let folder = Folder::new();
+    let (small, state) = (small(), folder.path("report.state"));
+    let args = ["report", "--data", &small, "--spp", "1,2,4", "--repeats", "3", "--state", &state];
+    let mut report = Command::new(env!("CARGO_BIN_EXE_rpfd")).args(args).stdout(std::process::Stdio::null()).spawn();
+    let report = report.as_mut().unwrap();
+    let kept = || std::fs::read_to_string(&state).unwrap_or_default();
+    while !kept().contains('\n') && report.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    report.kill().unwrap();
+    report.wait().unwrap();
+    let before = kept();
+    let whole = &before[..before.rfind('\n').unwrap() + 1];
+    let rows = json(args)["rows"].as_array().unwrap().clone();
+    let after = kept();
+    assert!(after.starts_with(whole) && after.lines().count() == 3 * 6 * 3, "{}", after.lines().count());
+    assert!(rows.len() == 3 * 6 && rows.iter().all(|row| row["repeats"] == 3 && row["repeatable"] == true));
+}
+
 #[test]
 fn a_file_that_is_no_state_is_left_alone() {
     let folder = Folder::new();
@@ -110,6 +203,28 @@ fn a_file_that_is_no_state_is_left_alone() {
         assert_eq!(bytes(&notes), text.as_bytes());
     }
 }
+
+/// Columns of the CSV, and where the JSON has them.
+const SHARED: [(&str, &[&str]); 18] = [
+    ("relmse_less_own", &["relmse_less_own"]),
+    ("mse_less_own", &["mse_less_own"]),
+    ("own_relmse", &["own_relmse"]),
+    ("own_mse", &["own_mse"]),
+    ("repeats", &["repeats"]),
+    ("cpu_s_per_mpx", &["cpu_seconds_per_megapixel", "median"]),
+    ("wall_s_per_mpx", &["wall_seconds_per_megapixel", "median"]),
+    ("planned_bytes", &["planned_bytes"]),
+    ("peak_resident_bytes", &["peak_resident_bytes"]),
+    ("unfiltered_slope", &["unfiltered_slope", "value"]),
+    ("equal_spp", &["equal_spp"]),
+    ("total_s_per_mpx", &["total_seconds_per_megapixel"]),
+    ("plain_s_per_mpx", &["plain_seconds_per_megapixel"]),
+    ("plain_relmse_at_total", &["plain_relmse_at_total"]),
+    ("left_out_bytes", &["left_out_bytes"]),
+    ("work_saved", &["work_saved"]),
+    ("settled", &["settled"]),
+    ("settled_error", &["settled_error"]),
+];
 
 #[test]
 fn the_page_needs_nothing_else_and_has_every_row() {
@@ -136,14 +251,33 @@ fn the_page_needs_nothing_else_and_has_every_row() {
     let rows = numbers["rows"].as_array().unwrap();
     assert_eq!((rows.len(), csv.lines().count()), (12, 13));
     let table = String::from_utf8(output.stdout).unwrap();
+    let columns = cells(csv.lines().next().unwrap());
     for (row, line) in rows.iter().zip(csv.lines().skip(1)) {
         let cells = cells(line);
         assert_eq!((&row["data"], &row["method"]), (&cells[0].as_str().into(), &cells[3].as_str().into()));
-        assert_eq!(row["errors"]["relmse"].to_string().parse::<f64>().unwrap(), cells[8].parse::<f64>().unwrap());
+        let csv = |name: &str| cells[columns.iter().position(|column| column == name).unwrap()].as_str();
+        for (name, value) in row["errors"].as_object().unwrap() {
+            assert_eq!(value.as_f64(), csv(name).parse().ok(), "{name}");
+        }
+        for (name, field) in SHARED {
+            let value = field.iter().fold(row, |value, key| &value[key]);
+            assert_eq!(value.as_f64(), csv(name).parse().ok(), "{name}");
+        }
+        assert_eq!(row["pareto"].to_string(), csv("pareto"));
         let spp = row["spp"].as_u64().unwrap();
         let start = format!("<td>{}</td><td>{spp}</td><td>{}</td>", cells[0], cells[3]);
-        assert!(page.contains(&start), "{start}");
-        assert!(table.lines().any(|line| line.starts_with(&cells[0]) && line.contains(&cells[3])));
+        let shown = page.split("<tr").find(|line| line.contains(&start)).unwrap_or_else(|| panic!("{start}"));
+        let spp_text = spp.to_string();
+        let spp_and_method = [spp_text.as_str(), cells[3].as_str()];
+        let line = table.lines().find(|line| {
+            let after = line.strip_prefix(cells[0].as_str()).unwrap_or_default();
+            after.split_whitespace().take(2).eq(spp_and_method)
+        });
+        for name in ["relmse_less_own", "mse_less_own", "smape", "cpu_s_per_mpx", "total_s_per_mpx", "plain_s_per_mpx"]
+        {
+            let short = short(csv(name).parse().unwrap());
+            assert!(shown.contains(&format!("<td>{short}</td>")) && line.unwrap().contains(&short), "{name}: {short}");
+        }
         // Samples and filter, and the plain samples of the same error.
         let cpu = row["cpu_seconds_per_megapixel"]["median"].as_f64().unwrap();
         assert_eq!(row["total_seconds_per_megapixel"].as_f64().unwrap(), 3.0 * spp as f64 + cpu);
@@ -151,6 +285,11 @@ fn the_page_needs_nothing_else_and_has_every_row() {
         if row["preset"] == "unfiltered" {
             assert!((row["equal_spp"].as_f64().unwrap() - spp as f64).abs() < 1e-9);
         }
+    }
+    for column in COLUMNS {
+        assert!(table.contains(&format!("{}: {}\n", column.title, column.formula)));
+        assert!(page.contains(&svg::escape(column.formula)));
+        assert_eq!(numbers["formulas"][column.name], column.formula);
     }
     for part in
         ["ε = 0.01", "prefers-color-scheme", "data:image/png;base64,", "reference", "difference", "SIMD", "slope"]

@@ -1,6 +1,7 @@
 //! `rpfd stability`: the table, the JSON and the exit code.
 
 use super::*;
+use rpfd::filter::method::PRESETS;
 
 #[test]
 fn json_has_every_figure_and_bound() {
@@ -21,6 +22,18 @@ fn json_has_every_figure_and_bound() {
     }
     assert!(case["energy"].is_f64() && case["bounds"]["reason"].is_string());
     assert!(cases[1]["clean"].is_null());
+}
+
+/// Every preset, as when none is named: also those that have not what a case sets.
+#[test]
+fn every_preset_runs() {
+    let report = json(["stability", "--case", "spp-1024"]);
+    let cases = report["cases"].as_array().unwrap();
+    assert_eq!((cases.len(), &report["ok"]), (PRESETS.len(), &PRESETS.len().into()));
+    for (case, (preset, _)) in cases.iter().zip(PRESETS) {
+        let neighbors = matches!(*preset, "lean" | "paper-fast" | "paper").then_some("2048");
+        assert_eq!((&case["preset"], case["parameters"]["max_neighbors"].as_str()), (&(*preset).into(), neighbors));
+    }
 }
 
 #[test]

@@ -263,7 +263,7 @@ fn state_failure(path: &Path, error: &std::io::Error) -> Failure {
 /// Everything that is to be measured, in the order of the report.
 fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Failure> {
     let mut jobs = Vec::new();
-    let version = Machine::build();
+    let (version, cpu) = (Machine::build(), Machine::here(args.simd.level).cpu);
     for (index, set) in sets.iter().enumerate() {
         let image = Rect::new(0, 0, set.image[0], set.image[1]);
         if let Some(part) = args.crop.filter(|part| image.intersection(part) != Some(*part)) {
@@ -294,6 +294,7 @@ fn jobs(args: &Args, sets: &[DataSet], methods: &[Named]) -> Result<Vec<Job>, Fa
                         parameters: Key::parameters_of(&named.method),
                         threads: threads as usize,
                         simd: args.simd.level.name().to_owned(),
+                        cpu: cpu.clone(),
                         seed: args.seed,
                         repeat,
                         version: version.clone(),
@@ -421,22 +422,19 @@ fn write(
     let contents: [&dyn Fn() -> String; 4] = [&json, &|| table::csv(rows, seconds_per_sample), &html, &plots];
     crate::cli::write_texts(outputs, contents)?;
     if args.json_errors() {
-        print!("{}", json());
+        say!("{}", json().trim_end());
         return Ok(());
     }
     let Machine { cpu, cores, simd, os, version } = &machine;
-    println!("{version} on {cpu}, {cores} processors, SIMD {simd}, {os}\n");
-    print!("{}", table::text(&table::cells(rows, seconds_per_sample)));
-    let notes = &table::NOTES[..if seconds_per_sample.is_some() { 6 } else { 5 }];
-    println!("\n{}", notes.join("\n"));
-    let tables = [(table::tolerances(rows), table::TOLERANCE_NOTE), (table::left_out(rows), table::LEFT_OUT_NOTE)];
-    for (table, note) in tables.iter().filter(|((_, cells), _)| !cells.is_empty()) {
-        println!("\n{}\n{note}", table::text(table));
+    say!("{version} on {cpu}, {cores} processors, SIMD {simd}, {os}\n");
+    say!("{}", table::text(&table::cells(rows, seconds_per_sample)));
+    say!("{}", table::notes(rows, seconds_per_sample).join("\n"));
+    for (_, table, note) in table::others(rows) {
+        say!("\n{}\n{note}", table::text(&table));
     }
-    let unlike = rows.iter().filter(|row| !row.repeatable);
-    unlike.for_each(|row| println!("NOT REPEATABLE: the errors of {} on {} differ", row.label, row.key.data));
+    say!("\n{}", table::formulas());
     for path in [&args.csv, &args.html, &args.svg].into_iter().flatten() {
-        println!("{}", path.display());
+        say!("{}", path.display());
     }
     Ok(())
 }

@@ -4,13 +4,20 @@
 //! a loop over features. The steps are discontinuous (a candidate is in or out, a value falls into one bin or the next),
 //! so each is compared on the same inputs and decisions, and says how near its decisions were to falling the other way.
 //!
-//! [`Whole`] runs all of it over a tile; of the fast path it takes the random draws only.
+//! [`Whole`] runs all of it over a tile; of the fast path it takes the random draws only. [`baseline`] is the same for the
+//! methods that RPF is compared with.
 
+mod baseline;
 mod whole;
 
+pub use baseline::baseline;
 pub use whole::{Step, Whole};
 
 use super::rpf::Params;
+use super::{Rect, SampleTile};
+
+/// Colours R, G, B.
+pub type Color = [f64; 3];
 
 /// How near a decision was to its threshold, relative to the threshold's size.
 pub type Margin = f64;
@@ -235,4 +242,21 @@ pub fn tame_spikes(samples: &[f64]) -> (Vec<f64>, Margin) {
 /// A pixel's value after the last iteration.
 pub fn pixel(samples: &[[f64; 3]]) -> [f64; 3] {
     std::array::from_fn(|k| mean(&samples.iter().map(|c| c[k]).collect::<Vec<_>>()))
+}
+
+/// The core's pixels, of filtered ones by their index in the data window: one without samples becomes the mean of those in
+/// the smallest window around it that has any, up to `reach` pixels away; if none has, it is black.
+fn cover(tile: &SampleTile, reach: u32, filtered: impl Fn(usize) -> Option<Color>) -> Vec<Color> {
+    let (core, window) = (tile.geometry().core(), tile.geometry().window());
+    let at = |x: u32, y: u32| {
+        let around = |radius: u32| {
+            let around = Rect::new(x, y, 1, 1).grown(radius, &window);
+            let rows = around.y..around.bottom();
+            let all = rows.flat_map(|y| (around.x..around.right()).map(move |x| window.index(x, y)));
+            let found: Vec<Color> = all.filter_map(&filtered).collect();
+            (!found.is_empty()).then(|| pixel(&found))
+        };
+        (0..=reach).find_map(around).unwrap_or([0.0; 3])
+    };
+    (core.y..core.bottom()).flat_map(|y| (core.x..core.right()).map(move |x| (x, y))).map(|(x, y)| at(x, y)).collect()
 }

@@ -4,7 +4,9 @@
 
 use super::super::rpf::{Offsets, Params, draws, region};
 use super::super::{Rect, Role, SampleTile};
-use super::{Cluster, Columns, Weights, bin, deviation, filter, mean, normalise, pixel, tame_spikes, weigh};
+use super::{
+    Cluster, Color, Columns, Weights, bin, cover, deviation, filter, mean, normalise, pixel, tame_spikes, weigh,
+};
 use std::collections::HashMap;
 
 /// Within this of a bin's edge, in deviations, a value may fall either way in f32.
@@ -16,9 +18,6 @@ const NEAR_SPIKE: f64 = 1e-5;
 
 /// Errors of pixels are computed in f64 by both, too.
 const NEAR_SETTLED: f64 = 1e-9;
-
-/// Colours R, G, B.
-type Color = [f64; 3];
 
 /// A tile to be filtered as a whole.
 pub struct Whole<'a> {
@@ -289,22 +288,8 @@ impl<'a> Whole<'a> {
 
     /// The core's pixels; those without samples are filled from those around them.
     pub fn pixels(&self, colors: &[Color]) -> Vec<Color> {
-        let (core, window) = (self.tile.geometry().core(), self.tile.geometry().window());
         let reach = self.params.boxes.last().map_or(0, |b| b / 2);
-        let at = |x: u32, y: u32| {
-            let around = |radius: u32| {
-                let around = Rect::new(x, y, 1, 1).grown(radius, &window);
-                let rows = around.y..around.bottom();
-                let all = rows.flat_map(|y| (around.x..around.right()).map(move |x| window.index(x, y)));
-                let found: Vec<Color> = all.filter_map(|index| self.pixel(index, colors)).collect();
-                (!found.is_empty()).then(|| pixel(&found))
-            };
-            (0..=reach).find_map(around).unwrap_or([0.0; 3])
-        };
-        (core.y..core.bottom())
-            .flat_map(|y| (core.x..core.right()).map(move |x| (x, y)))
-            .map(|(x, y)| at(x, y))
-            .collect()
+        cover(self.tile, reach, |index| self.pixel(index, colors))
     }
 }
 

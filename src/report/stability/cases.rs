@@ -96,7 +96,11 @@ fn colors() -> Vec<Case> {
         .back(Back::Divided(-1.0)),
         Case::new("negative-some", Base::Image, cancels, |s| some(s.channel("color"), 2, 5, &[-1.0, -30.0])),
         Case::new("denormal-color", Base::Image, denormal, |s| Samples::map(s.channel("color"), |v| v * 1e-40))
-            .back(Back::Divided(f64::from(1e-40_f32))),
+            .back(Back::Divided(f64::from(1e-40_f32)))
+            .known_of_baselines(COLOR_SIGMA)
+            // At first 1e-5 as everywhere: but each product of a weight and a colour is rounded to 1.4e-45, 1.4e-5 of the
+            // colour, and a pixel is the sum of tens of them.
+            .whole_of_baselines(super::WHOLE, 1e-4),
         Case::new(
             "denormal-features",
             Base::Image,
@@ -104,7 +108,10 @@ fn colors() -> Vec<Case> {
             |s| {
                 Samples::map(s.features(), |v| v * 1e-40);
             },
-        ),
+        )
+        // Not bounded: a cross-bilateral filter scales differences by 1e30 at most, so positions that all lie within 1e-30
+        // of each other are one place to it, and two to the oracle.
+        .whole_of_baselines(f64::INFINITY, f64::INFINITY),
         Case::new("all-equal", Base::Image, exact_steps("nothing varies: every mean is the value itself"), |s| {
             s.planes.iter_mut().for_each(|plane| {
                 let first = plane[0];
@@ -210,6 +217,9 @@ fn far_from_the_origin() -> Vec<Case> {
 const UNITS: &str = "a difference of 0.1 is never too far, in the scene's own unit: in smaller units everything is accepted, in \
      larger ones only what is near";
 
+const COLOR_SIGMA: &str =
+    "a bilateral filter's color_sigma is a radiance: the darker the image, the less colours differ by it";
+
 fn scales() -> Vec<Case> {
     let mut cases = Vec::new();
     let reason = "the unit is nothing that the image shows";
@@ -230,13 +240,16 @@ fn scales() -> Vec<Case> {
         let case = Case::new(format!("exposure-{name}"), Base::Image, bounds, move |s| {
             Samples::map(s.channel("color"), |v| v * scale)
         });
-        cases.push(case.back(Back::Divided(scale.into())));
+        cases.push(case.back(Back::Divided(scale.into())).known_of_baselines(COLOR_SIGMA));
     }
     cases
 }
 
 const TWICE: &str = "dependencies are of pairs only: what two features both say counts twice, in their own weights and \
      against the others";
+
+const EVERY_CHANNEL: &str = "a cross-bilateral filter has a Gaussian for every feature channel, whatever the others say: one more \
+     narrows its weights";
 
 fn features() -> Vec<Case> {
     let feature = Role::Feature { position: false };
@@ -267,13 +280,13 @@ fn features() -> Vec<Case> {
             for copy in ["N again", "N once more"] {
                 like(s, "N", copy, feature, |v| v);
             }
-        }).known(TWICE),
+        }).known(TWICE).known_of_baselines(EVERY_CHANNEL),
         Case::new("features-correlated", Base::Image, usual(Against::Seeds(2.0), "a linear function says nothing new"), move |s| {
             like(s, "albedo", "shade", feature, |v| 1.0 - 2.0 * v);
-        }).known(TWICE),
+        }).known(TWICE).known_of_baselines(EVERY_CHANNEL),
         Case::new("feature-is-random", Base::Image, usual(Against::Seeds(2.0), "a feature that is a random parameter has weight 0; it still clusters"), move |s| {
             like(s, "lens", "lens again", feature, |v| v);
-        }).known("a feature of noise rejects three candidates in a thousand and more, and takes its share of the colour's dependence"),
+        }).known("a feature of noise rejects three candidates in a thousand and more, and takes its share of the colour's dependence").known_of_baselines(EVERY_CHANNEL),
         Case::new("random-is-color", Base::Image, usual(Against::Nothing, "a colour that is a random parameter is noise: it is averaged away"), move |s| {
             like(s, "color", "noise", Role::Random { uniform: false }, |v| v);
         }),

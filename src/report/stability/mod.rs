@@ -27,7 +27,7 @@ pub use measure::Deviation;
 pub use run::{Lab, Outcome, Steps, Verdict};
 pub use samples::Base;
 
-use crate::filter::{Method, ParameterError, SampleTile};
+use crate::filter::{Method, ParameterError, SampleTile, method::Algorithm};
 use samples::Samples;
 
 /// Greatest deviation of a step: f32 columns are within 3e-5 deviations of the oracle's (a bound of its tests), and the
@@ -44,6 +44,9 @@ const WHOLE: f64 = 0.02;
 /// Median deviation of the whole: some iterations of f32 sums, each of about 10 roundings.
 const WHOLE_MEDIAN: f64 = 1e-5;
 
+/// RMS deviation of what differs in the order of sums only: some roundings of f32, and sums of a hundred in f64.
+const ORDER: f64 = 1e-6;
+
 /// What is compared with the clean case, and how far it may be from it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Against {
@@ -55,7 +58,7 @@ pub enum Against {
     Rms(f64),
     /// Median deviation: what is wrong is in a few places, most of the image must not care.
     Median(f64),
-    /// RMS deviation, as a multiple of that between two seeds.
+    /// RMS deviation, as a multiple of that between two seeds; of methods without random draws, rounding is left.
     Seeds(f64),
 }
 
@@ -125,10 +128,14 @@ pub struct Case {
     pub base: Base,
     /// How the image is brought back.
     pub back: Back,
-    /// What is asked of it.
-    pub bounds: Bounds,
+    /// What is asked of it; see [`Case::bounds_of`].
+    bounds: Bounds,
     /// Why the published algorithm is known to miss the bounds of the clean case and of energy, if it is.
-    pub known: Option<&'static str>,
+    known: Option<&'static str>,
+    /// Why the baselines are, if any is.
+    known_of_baselines: Option<&'static str>,
+    /// RMS and median deviation of the whole that baselines may have, where that is not what RPF may.
+    whole_of_baselines: Option<[f64; 2]>,
     /// Parameters set in every preset.
     settings: Vec<(&'static str, &'static str)>,
     /// The samples come over the wire in half precision.
@@ -150,6 +157,8 @@ impl Case {
             back: Back::Same,
             bounds,
             known: None,
+            known_of_baselines: None,
+            whole_of_baselines: None,
             settings: Vec::new(),
             f16: false,
             change,
@@ -162,6 +171,14 @@ impl Case {
 
     fn known(self, known: &'static str) -> Self {
         Self { known: Some(known), ..self }
+    }
+
+    fn known_of_baselines(self, known: &'static str) -> Self {
+        Self { known_of_baselines: Some(known), ..self }
+    }
+
+    fn whole_of_baselines(self, rms: f64, median: f64) -> Self {
+        Self { whole_of_baselines: Some([rms, median]), ..self }
     }
 
     fn over_the_wire_as_f16(self) -> Self {
@@ -180,10 +197,28 @@ impl Case {
         if self.f16 { samples::over_the_wire_as_f16(&tile) } else { tile }
     }
 
-    /// The method of a preset: `paper` with smaller boxes, so that the oracle is done with it.
-    fn method(&self, preset: &str) -> Result<Method, ParameterError> {
+    /// The method of a preset: `paper` with smaller boxes, so that the oracle is done with it, and of what the case sets
+    /// whatever the preset has.
+    pub fn method(&self, preset: &str) -> Result<Method, ParameterError> {
+        let has = Method::preset(preset)?.parameters();
         let smaller: &[_] = if preset == "paper" { &[("boxes", "15,9,5"), ("fractions", "0.5,0.5,0.5")] } else { &[] };
-        let settings: &[_] = if preset == "unfiltered" { &[] } else { &self.settings };
+        let settings = self.settings.iter().filter(|(name, _)| has.iter().any(|(known, _)| known == name));
         Method::with(preset, smaller.iter().chain(settings).copied())
+    }
+
+    /// What is asked of a method.
+    pub fn bounds_of(&self, method: &Method) -> Bounds {
+        match (method.algorithm(), self.whole_of_baselines) {
+            (Algorithm::Rpf(_), _) | (_, None) => self.bounds.clone(),
+            (_, Some([whole, whole_median])) => Bounds { whole, whole_median, ..self.bounds.clone() },
+        }
+    }
+
+    /// Why a method is known to miss the bounds of the clean case and of energy, if it is.
+    pub fn known_cause(&self, method: &Method) -> Option<&'static str> {
+        match method.algorithm() {
+            Algorithm::Rpf(_) => self.known,
+            _ => self.known_of_baselines,
+        }
     }
 }
