@@ -108,7 +108,8 @@ fn killed_at_random_points_the_image_is_the_same() {
     let expected = whole_exr(&samples(size, Rect::new(0, 0, side, side), 0, 1), &method, 5);
     let client = format!(r#"{{"width": {side}, "height": {side}, "id": "a", "seed": 5, "preset": "lean"}}"#);
     let neighbors = neighbors::opening("a", size, "lean", ("samples", 4));
-    let cores: Vec<Rect> = tiling(size, 40).collect();
+    // Of large images larger ones, whose halos together are less than the image itself.
+    let cores: Vec<Rect> = tiling(size, (side / 16).max(40)).collect();
     let with_halo = |halo: u32| cores.iter().map(|&core| (core, tile(size, core, halo))).collect::<Vec<_>>();
     let (bare, full) = (with_halo(0), with_halo(17));
     // A third without a halo, a third with one, a third with one of other samples than the cores bring.

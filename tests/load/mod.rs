@@ -4,6 +4,7 @@
 //! `RPFD_LOAD=full` runs all of it: 2000 tiles at each of three sizes of memory.
 
 mod client;
+mod large;
 mod process;
 
 use std::{
