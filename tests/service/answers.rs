@@ -100,16 +100,16 @@ fn a_result_has_the_images_own_room_once() {
 
 #[test]
 fn a_client_that_leaves_stops_the_encoding_of_its_result() {
-    const SIZE: [u32; 2] = [4096, 4096];
+    const SIZE: [u32; 2] = [1024, 2048];
     let server = Server::start(&METRICS);
     half(&server, SIZE);
-    send(&server, SIZE, 2048);
+    send(&server, SIZE, 512);
     let (folder, path) = (server.data_dir().join("images/a"), "/v1/images/a/result.exr");
     let beginnings = || {
         let files = std::fs::read_dir(&folder).unwrap().map(|file| file.unwrap().file_name().into_string().unwrap());
         files.filter(|name| name.starts_with(".tmp")).count()
     };
-    // Seconds of work: 65536 tiles.
+    // Seconds of work: 8192 tiles.
     let gone = ask(&server, &format!("{path}?compression=piz&tile=16"));
     wait_for("the encoding to begin", || beginnings() == 1);
     drop(gone);

@@ -405,7 +405,7 @@ fn regions_take_no_places_of_tiles_in_the_queue() {
     const SIZE: [u32; 2] = [256, 192];
     let metrics = ["--metrics-listen", "127.0.0.1:0", "--threads", "2"];
     let server = Server::start(&[&metrics[..], &["--memory", "32MiB", "--queue", "1"]].concat());
-    open(&server, SIZE, "lean");
+    open(&server, SIZE, "gaussian");
     // One tile after another waits, and so do regions at the same time.
     let body: Vec<u8> = tiling(SIZE, 32).flat_map(|core| tile(SIZE, core, 0)).collect();
     let lines = server.post("/v1/images/a/tiles", &body).lines();
