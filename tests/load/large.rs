@@ -1,6 +1,7 @@
 //! An image that is much larger than the memory, as bare cores that are made while they are sent.
 //!
-//! `RPFD_SIDE=16384` is 268 megapixels through 512 MiB; by default it is 1 megapixel through 32 MiB.
+//! `RPFD_SIDE=16384` is 268 megapixels through 512 MiB, in some ten minutes of CPU time; by default it is 1 megapixel
+//! through 32 MiB.
 
 use std::{
     io::{BufRead, BufReader, Write},
