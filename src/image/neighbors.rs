@@ -157,7 +157,8 @@ impl Neighbors {
         for region in ready {
             if !unfiltered(&this, stitcher, region).is_empty() {
                 this.regions.give_back(region);
-            } else if this.regions.last(region) && !this.provisional.contains_key(&region) {
+            } else if this.regions.last(region) && !this.provisional(region).any(|tile| stitcher.peek(&tile).is_some())
+            {
                 this.regions.done(region);
             } else {
                 this.regions.filtered(region);

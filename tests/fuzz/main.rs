@@ -10,6 +10,7 @@
 mod config;
 mod decoder;
 mod http;
+mod image;
 mod mutate;
 mod results;
 mod store;
