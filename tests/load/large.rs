@@ -99,7 +99,9 @@ fn an_image_larger_than_the_memory_passes_through_it() {
     let side: u32 = std::env::var("RPFD_SIDE").map_or(1024, |side| side.parse().unwrap());
     let (size, memory, scene) = ([side; 2], u64::from(side / 32) * MIB, Scene::by_name("all").unwrap());
     let method = Method::preset("lean").unwrap();
-    let server = Server::start(&["--memory", &memory.to_string(), "--threads", "2"]);
+    // However slow the machine, the cores wait for their turn.
+    let patient = ["--queue-deadline", "3600", "--idle-deadline", "3600"];
+    let server = Server::start(&[&["--memory", &memory.to_string(), "--threads", "2"], &patient[..]].concat());
     let process = Process::of(server.pid());
     let first = decoded(&scene, TileGeometry::with_halo(size, Rect::new(0, 0, 16, 16), 0).unwrap());
     let opening = json!({
