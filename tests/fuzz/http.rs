@@ -3,6 +3,7 @@
 use std::{
     io::{BufRead, BufReader, Read, Write},
     net::{SocketAddr, TcpStream},
+    path::Path,
     sync::OnceLock,
     time::Duration,
 };
@@ -17,9 +18,12 @@ use rpfd::{
 fn service() -> SocketAddr {
     static ADDRESS: OnceLock<SocketAddr> = OnceLock::new();
     *ADDRESS.get_or_init(|| {
+        // Without the images of the run before.
+        let data_dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fuzz-http");
+        let _ = std::fs::remove_dir_all(&data_dir);
         let config = Config {
             listen: "127.0.0.1:0".parse().unwrap(),
-            data_dir: std::env::temp_dir(),
+            data_dir,
             memory: ByteSize(64 << 20),
             threads: 1,
             idle_deadline: Duration::from_millis(500),

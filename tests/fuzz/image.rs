@@ -166,6 +166,10 @@ fn pool() -> &'static rayon::ThreadPool {
     POOL.get_or_init(|| rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap())
 }
 
+fn execution() -> Execution<'static> {
+    Execution { pool: Some(pool()), ..Execution::default() }
+}
+
 /// Images at work: one to which clients bring halos, and some that keep samples.
 fn examples() -> Vec<Memory> {
     let method = Method::with("gaussian", [("sigma", "1")]).unwrap();
@@ -174,8 +178,15 @@ fn examples() -> Vec<Memory> {
         let varying = kind == 3;
         let announced = Announced { channels: channels(), samples: 2, varying, region: 16 };
         let neighbors = (kind > 0).then_some(announced);
-        let description =
-            Description { size: SIZE, method: method.clone(), seed: 1, leave_out: true, neighbors, disk: 0 };
+        let description = Description {
+            size: SIZE,
+            method: method.clone(),
+            seed: 1,
+            leave_out: true,
+            neighbors,
+            owner: None,
+            disk: 0,
+        };
         let description = Description { disk: disk_bytes(&description), ..description };
         let folder = Memory::default();
         Image::create(&folder, &description).unwrap();
@@ -190,8 +201,8 @@ fn examples() -> Vec<Memory> {
         if kind == 2 {
             image.finish().unwrap();
         } else {
-            while let Some(job) = image.next_job(1, MEMORY).unwrap() {
-                image.run(&job, pool()).unwrap();
+            while let Some(job) = image.next_job(1, MEMORY, u64::MAX).unwrap() {
+                image.run(&job, &execution()).unwrap();
             }
         }
         drop(image);
@@ -326,10 +337,10 @@ fn open(folder: &Memory) -> &'static str {
         assert!(error.is_damage(), "{error}");
     }
     for _ in 0..16 {
-        match image.next_job(1, MEMORY) {
+        match image.next_job(1, MEMORY, u64::MAX) {
             Ok(Some(job)) => {
                 assert!(job.bytes <= MEMORY);
-                if let Err(error) = image.run(&job, pool()) {
+                if let Err(error) = image.run(&job, &execution()) {
                     assert!(!error.to_string().is_empty());
                     return "an image with damaged samples";
                 }
@@ -350,24 +361,27 @@ fn open(folder: &Memory) -> &'static str {
     "an image"
 }
 
-/// The same, and what it takes.
-fn measured(folder: &Memory, input: usize) -> &'static str {
+/// What redb may ask for, and not write to, before it refuses a store whose header says so: a page as large as pages get.
+const LARGEST_PAGE: u64 = 4 << 30;
+
+/// The same, and what it takes; so much more, if it is refused.
+fn measured(folder: &Memory, input: usize, refused: u64) -> &'static str {
     let before = ALLOCATIONS.current_usage() as u64;
     ALLOCATIONS.reset_peak_usage();
     let reached = open(folder);
     let peak = (ALLOCATIONS.peak_usage() as u64).saturating_sub(before);
     // Files are in memory here; an image has so many regions at most, some bytes each.
-    let most = 3 * MOST + MEMORY + (64 << 17) + 64 * input as u64;
+    let most = 3 * MOST + MEMORY + (64 << 17) + 64 * input as u64 + if reached == "refused" { refused } else { 0 };
     assert!(peak <= most, "{peak} bytes for an input of {input}");
     reached
 }
 
 /// The same, and how many panics were caught on the way.
-fn watched(folder: &Memory, input: usize) -> (&'static str, u64) {
+fn watched(folder: &Memory, input: usize, refused: u64) -> (&'static str, u64) {
     let before = PANICS.load(Ordering::SeqCst);
     QUIET.store(true, Ordering::SeqCst);
     // On the pool's own thread nothing waits for it.
-    let reached = catch_unwind(|| pool().install(|| measured(folder, input)));
+    let reached = catch_unwind(|| pool().install(|| measured(folder, input, refused)));
     QUIET.store(false, Ordering::SeqCst);
     (reached.unwrap_or_else(|_| panic!("{}", last_panic())), PANICS.load(Ordering::SeqCst) - before)
 }
@@ -421,7 +435,7 @@ fn records() {
         encode(&script)
     };
     let reached = fuzz("records", 20, make, |bytes, _| {
-        let (reached, panics) = watched(&folder(&decode(bytes)), bytes.len());
+        let (reached, panics) = watched(&folder(&decode(bytes)), bytes.len(), 0);
         // Not one that the store has caught either: its file is whole.
         assert_eq!(panics, 0, "{}", last_panic());
         reached
@@ -493,7 +507,7 @@ fn stores() {
         folder.files()[CANVAS].set_len(12 * u64::from(SIZE[0] * SIZE[1])).unwrap();
         let same = state == files[example].0;
         folder.put(STATE_FILE, state);
-        let (reached, _) = watched(&folder, 1 << 16);
+        let (reached, _) = watched(&folder, 1 << 16, LARGEST_PAGE);
         assert!(!same || reached == "an image");
         reached
     });
