@@ -3,11 +3,11 @@
 use super::bilateral::{self, Distances};
 use super::block::{Block, ColumnOrder};
 use super::cluster::Cluster;
-use super::information::Histograms;
+use super::information::{Histograms, whole_words};
 use super::neighborhood::{Center, Offsets, gather_rows};
 use super::params::Params;
 use super::relevance::Relevant;
-use super::statistics::{Span, impute, make_safe, normalise};
+use super::statistics::{Scale, Span, center, impute, make_safe, multiply};
 use super::weights::{Dependencies, Weights, steepness};
 use super::{grid::Grid, random, spikes, work::Columns};
 use crate::filter::lanes::{Simd, padded};
@@ -51,12 +51,12 @@ pub(crate) struct Scratch {
     rows: Vec<u32>,
     pub(super) count: usize,
     order: ColumnOrder,
-    /// Columns of the neighbourhood, `stride` values apart.
+    /// Columns of the neighbourhood, `stride` values apart: whole words of bit masks.
     columns: Vec<f32>,
     radiance: Vec<f32>,
     stride: usize,
-    /// Whether each column is constant.
-    constant: Vec<bool>,
+    /// What normalises each column.
+    scales: Vec<Scale>,
     histograms: Histograms,
     pub(super) dependencies: Dependencies,
     pub(crate) weights: Weights,
@@ -75,7 +75,7 @@ impl Scratch {
     /// Room for one thread.
     pub(crate) fn new(tile: &SampleTile, relevant: &Relevant, params: &Params, room: &Room, leave_out: bool) -> Self {
         let order = ColumnOrder::of(relevant);
-        let (stride, columns, features) = (padded(room.rows), order.columns(), relevant.features());
+        let (stride, columns, features) = (whole_words(room.rows), order.columns(), relevant.features());
         Self {
             block: Block::with_capacity(room.pixels, room.samples, tile, &order),
             cluster: Cluster::new(features, params),
@@ -84,7 +84,7 @@ impl Scratch {
             columns: vec![0.0; columns * stride],
             radiance: vec![0.0; 3 * stride],
             stride,
-            constant: vec![true; columns],
+            scales: vec![Scale::default(); columns],
             histograms: Histograms::with_capacity(columns, stride, params.bins, leave_out),
             dependencies: Dependencies::new(features.len()),
             weights: Weights::new(features.len()),
@@ -99,9 +99,9 @@ impl Scratch {
 
     /// Bytes that [`Scratch::new`] allocates.
     pub(crate) fn bytes(order: &ColumnOrder, room: &Room, varying: bool, bins: u32) -> u64 {
-        let (stride, columns, features) = (padded(room.rows), order.columns(), order.features.len());
+        let (stride, columns, features) = (whole_words(room.rows), order.columns(), order.features.len());
         let values = stride * size_of::<u32>() + (columns + 3) * stride * size_of::<f32>();
-        let small = columns
+        let small = columns * size_of::<Scale>()
             + features * (6 * size_of::<f64>() + size_of::<f32>())
             + (features + 3) * (size_of::<usize>() + size_of::<f32>());
         (values + small) as u64
@@ -126,9 +126,9 @@ impl Scratch {
         }
     }
 
-    /// Normalises some gathered columns, and scales them; says what they spanned.
+    /// Brings some gathered columns to zero mean, and finds what normalises them.
     #[inline(always)]
-    fn normalise<S: Simd, const N: usize>(&mut self, simd: S, columns: [usize; N], factors: &[f32; N]) -> [Span; N] {
+    fn center<S: Simd, const N: usize>(&mut self, simd: S, columns: [usize; N]) {
         let count = self.count;
         for column in columns {
             if self.order.features.contains(&column) && self.cluster.missing(column) {
@@ -136,31 +136,46 @@ impl Scratch {
                 impute(simd, values, count);
             }
         }
-        let mut columns = self.columns(columns);
-        let spans = make_safe(simd, &mut columns);
-        normalise(simd, &mut columns, count, &spans, factors);
-        spans
+        let mut places = self.columns(columns);
+        let spans = make_safe(simd, &mut places);
+        let scales = center(simd, &mut places, count, &spans);
+        for (column, scale) in columns.into_iter().zip(scales) {
+            self.scales[column] = scale;
+        }
     }
 
-    /// The normalised columns of the colour channels, scaled, from the radiance; of a grey scene only the first.
+    /// The columns of the colour channels, from the radiance, at zero mean; of a grey scene only the first.
     #[inline(always)]
-    fn normalise_colors<S: Simd>(&mut self, simd: S, twins: &[usize; 3], spans: &[Span; 3], factors: &[f32; 3]) {
-        let (rows, first) = (padded(self.count), self.order.colors.start * self.stride);
-        let places = self.columns[first..].chunks_exact_mut(self.stride);
+    fn center_colors<S: Simd>(&mut self, simd: S, twins: &[usize; 3], spans: &[Span; 3]) {
+        let (rows, first, count) = (padded(self.count), self.order.colors.start, self.count);
+        let places = self.columns[first * self.stride..].chunks_exact_mut(self.stride);
         for (place, radiance) in places.zip(self.radiance.chunks_exact(self.stride)) {
             place[..rows].copy_from_slice(&radiance[..rows]);
         }
-        let (count, first) = (self.count, self.order.colors.start);
         match twins {
-            [0, 0, 0] => normalise(simd, &mut self.columns([first]), count, &[spans[0]], &[factors[0]]),
-            _ => normalise(simd, &mut self.columns([first, first + 1, first + 2]), count, spans, factors),
+            [0, 0, 0] => {
+                let [scale] = center(simd, &mut self.columns([first]), count, &[spans[0]]);
+                self.scales[first] = scale;
+            }
+            _ => {
+                let scales = center(simd, &mut self.columns([first, first + 1, first + 2]), count, spans);
+                self.scales[first..].copy_from_slice(&scales);
+            }
         }
+    }
+
+    /// Scales a column of zero mean: normalises it, times a factor.
+    #[inline(always)]
+    pub(super) fn multiply<S: Simd>(&mut self, simd: S, column: usize, factor: f32) {
+        let scale = self.scales[column];
+        let [values] = self.columns([column]);
+        multiply(simd, values, &scale, factor);
     }
 
     /// Columns of the neighbourhood that are not constant there; of equal colours one.
     pub(super) fn varying(&self, twins: &[usize; 3]) -> Columns {
         let count = |mut columns: std::ops::Range<usize>| {
-            let varying = columns.by_ref().filter(|&column| !self.constant[column]).count();
+            let varying = columns.by_ref().filter(|&column| !self.scales[column].constant()).count();
             varying as u64
         };
         let ColumnOrder { features, positions, random, colors } = self.order.clone();
@@ -169,13 +184,13 @@ impl Scratch {
             positions: count(positions),
             random: count(random),
             features: count(features),
-            colors: own.filter(|(column, _)| !self.constant[*column]).count() as u64,
+            colors: own.filter(|(column, _)| !self.scales[*column].constant()).count() as u64,
         }
     }
 }
 
-/// Columns that are normalised at a time.
-const BATCH: usize = 4;
+/// Columns that are normalised at a time: AVX2 has registers for no more.
+const BATCH: usize = 2;
 
 impl Pass<'_> {
     /// Whether a pixel is passed through.
@@ -239,7 +254,7 @@ impl Pass<'_> {
         );
         simd.vectorize(
             #[inline(always)]
-            || self.normalise_columns(simd, scratch, spans),
+            || self.center_columns(simd, scratch, spans),
         );
         simd.vectorize(
             #[inline(always)]
@@ -260,42 +275,35 @@ impl Pass<'_> {
         block.gather_others(simd, rows, &mut columns[others..], *stride);
     }
 
-    /// Step 2: normalises every column, and notes which are constant.
+    /// Step 2: brings every column to zero mean, and finds what normalises it.
     #[inline(always)]
-    pub(super) fn normalise_columns<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
-        let ColumnOrder { features, positions, random, colors } = scratch.order.clone();
+    pub(super) fn center_columns<S: Simd>(&self, simd: S, scratch: &mut Scratch, spans: &[Span; 3]) {
+        let ColumnOrder { features, positions, random, .. } = scratch.order.clone();
         for part in [features, positions.start..random.end] {
             let whole = part.end - part.len() % BATCH;
             for first in (part.start..whole).step_by(BATCH) {
-                let batch = [first, first + 1, first + 2, first + 3];
-                let spans = scratch.normalise(simd, batch, &[1.0; BATCH]);
-                for (column, span) in batch.into_iter().zip(spans) {
-                    scratch.constant[column] = span.constant();
-                }
+                scratch.center(simd, [first, first + 1]);
             }
             for column in whole..part.end {
-                let [span] = scratch.normalise(simd, [column], &[1.0]);
-                scratch.constant[column] = span.constant();
+                scratch.center(simd, [column]);
             }
         }
-        scratch.normalise_colors(simd, self.relevant.twins(), spans, &[1.0; 3]);
-        for (column, span) in colors.zip(spans) {
-            scratch.constant[column] = span.constant();
-        }
+        scratch.center_colors(simd, self.relevant.twins(), spans);
     }
 
-    /// The histograms of all normalised columns.
+    /// The histograms of all columns, normalised.
     #[inline(always)]
     pub(super) fn count_bins<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
-        let Scratch { histograms, columns, constant, order, count, stride, .. } = scratch;
+        let Scratch { histograms, columns, scales, order, count, stride, .. } = scratch;
         let ColumnOrder { features, positions, random, colors } = order.clone();
         histograms.start(*count);
         let twins = self.relevant.twins().iter().enumerate();
         let colors = colors.zip(twins).filter(|(_, (channel, twin))| channel == *twin).map(|(column, _)| column);
         for column in features.chain(positions.start..random.end).chain(colors) {
-            let values = &columns[column * *stride..][..padded(*count)];
-            histograms.set(simd, column, values, constant[column], self.terms);
+            let values = &columns[column * *stride..][..whole_words(*count)];
+            histograms.set(simd, column, values, &scales[column]);
         }
+        histograms.finish(simd, self.terms);
     }
 
     /// Steps 3 and 4, from the histograms.
@@ -303,25 +311,18 @@ impl Pass<'_> {
     pub(super) fn measure_dependencies<S: Simd>(&self, simd: S, scratch: &mut Scratch) {
         let Scratch { histograms, dependencies, order, .. } = &mut *scratch;
         let ColumnOrder { features, positions, random, colors } = order.clone();
+        histograms.measure(simd, colors.clone(), features.start..random.end, self.terms);
+        histograms.measure(simd, features.clone(), positions.start..random.end, self.terms);
         for (channel, &twin) in self.relevant.twins().iter().enumerate() {
             let column = colors.start + twin;
-            if twin == channel {
-                dependencies.color_position[channel] =
-                    histograms.information(simd, column, &positions, self.terms).iter().sum();
-                dependencies.color_random[channel] =
-                    histograms.information(simd, column, &random, self.terms).iter().sum();
-                dependencies.color_features[channel]
-                    .copy_from_slice(histograms.information(simd, column, &features, self.terms));
-            } else {
-                dependencies.copy_color(twin, channel);
-            }
+            dependencies.color_position[channel] = histograms.information(column, &positions).iter().sum();
+            dependencies.color_random[channel] = histograms.information(column, &random).iter().sum();
+            dependencies.color_features[channel].copy_from_slice(histograms.information(column, &features));
         }
         dependencies.add_colors();
         for (feature, column) in features.enumerate() {
-            dependencies.feature_position[feature] =
-                histograms.information(simd, column, &positions, self.terms).iter().sum();
-            dependencies.feature_random[feature] =
-                histograms.information(simd, column, &random, self.terms).iter().sum();
+            dependencies.feature_position[feature] = histograms.information(column, &positions).iter().sum();
+            dependencies.feature_random[feature] = histograms.information(column, &random).iter().sum();
         }
         scratch.weights.set(&scratch.dependencies, self.t);
     }
@@ -409,36 +410,25 @@ impl Pass<'_> {
         if fresh {
             let features = active.partition_point(|&column| column < scratch.order.features.end);
             let (batches, rest) = active[..features].as_chunks::<BATCH>();
-            let (factor_batches, factor_rest) = factors[..features].as_chunks::<BATCH>();
-            for (batch, factors) in batches.iter().zip(factor_batches) {
-                let spans = scratch.normalise(simd, *batch, factors);
-                for (&column, span) in batch.iter().zip(spans) {
-                    scratch.constant[column] = span.constant();
-                }
+            for batch in batches {
+                scratch.center(simd, *batch);
             }
-            for (&column, &factor) in rest.iter().zip(factor_rest) {
-                let [span] = scratch.normalise(simd, [column], &[factor]);
-                scratch.constant[column] = span.constant();
+            for column in rest {
+                scratch.center(simd, [*column]);
             }
             if features < active.len() {
-                scratch.normalise_colors(simd, self.relevant.twins(), spans, &scratch.weights.color.map(factor));
-                for (column, span) in scratch.order.colors.clone().zip(spans) {
-                    scratch.constant[column] = span.constant();
-                }
+                scratch.center_colors(simd, self.relevant.twins(), spans);
             }
-        } else {
-            for (index, (&column, factor)) in active.iter().zip(&factors).enumerate() {
-                if active[..index].contains(&column) {
-                    continue;
-                }
-                let [values] = scratch.columns([column]);
-                values.iter_mut().for_each(|v| *v *= factor);
+        }
+        for (index, (column, factor)) in active.iter().zip(&factors).enumerate() {
+            if !active[..index].contains(column) {
+                scratch.multiply(simd, *column, *factor);
             }
         }
         scratch.loaded = active.iter().enumerate().filter(|(i, column)| !active[..*i].contains(column)).count();
         // Nor do the differences in a column that is constant here add anything.
         if self.execution.leave_out {
-            active.retain(|&column| !scratch.constant[column]);
+            active.retain(|&column| !scratch.scales[column].constant());
         }
         (scratch.active, scratch.factors) = (active, factors);
     }

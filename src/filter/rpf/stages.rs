@@ -85,7 +85,7 @@ impl Stages<'_> {
                 pass.load_columns(simd, scratch);
                 *spans = pass.load_radiance(simd, scratch);
             }
-            Stage::Normalise => pass.normalise_columns(simd, scratch, spans),
+            Stage::Normalise => pass.center_columns(simd, scratch, spans),
             Stage::Histograms => pass.count_bins(simd, scratch),
             Stage::Information => pass.measure_dependencies(simd, scratch),
             Stage::Bilateral => {

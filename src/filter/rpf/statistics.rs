@@ -131,9 +131,61 @@ fn safe_scale(size: f32) -> f32 {
     f32::from_bits((EXPONENT_BIAS + target - exponent) << 23)
 }
 
+/// What brings a column [of zero mean](center) to unit deviation.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Scale {
+    /// Inverse of the deviation (with n, not n - 1); 0 if all values are equal, since not even rounding may leave anything
+    /// of them then.
+    pub(crate) inverse: f32,
+    /// The least and the greatest value at unit deviation.
+    pub(crate) ends: [f32; 2],
+}
+
+impl Scale {
+    /// Whether all values are equal.
+    pub(crate) fn constant(&self) -> bool {
+        self.inverse == 0.0
+    }
+}
+
+/// Brings the first `n` values of some padded columns, [of safe size](make_safe), to zero mean, in place, and says what
+/// brings them to unit deviation. Two-pass and shifted. The padding's values mean nothing afterwards.
+#[inline(always)]
+pub(crate) fn center<S: Simd, const N: usize>(
+    simd: S,
+    columns: &mut [&mut [f32]; N],
+    n: usize,
+    spans: &[Span; N],
+) -> [Scale; N] {
+    let mut shifts = [[0.0; 2]; N];
+    for k in 0..N {
+        shifts[k] = [columns[k][0], spans[k].total / n as f32];
+    }
+    let mut squares = [Lanes::splat(simd, 0.0); N];
+    let whole = n - n % LANES;
+    for start in (0..whole).step_by(LANES) {
+        for k in 0..N {
+            let deviation = shift(simd, &mut columns[k][start..start + LANES], shifts[k]);
+            squares[k] += deviation * deviation;
+        }
+    }
+    let mut scales = [Scale::default(); N];
+    for k in 0..N {
+        if whole < n {
+            let deviation = shift(simd, &mut columns[k][whole..whole + LANES], shifts[k]);
+            squares[k] += keep_first(simd, deviation * deviation, n - whole);
+        }
+        let Span { min, max, scale, .. } = spans[k];
+        let inverse = if spans[k].constant() { 0.0 } else { 1.0 / (sum(squares[k]) / n as f32).sqrt() };
+        let [first, mean] = shifts[k];
+        scales[k] = Scale { inverse, ends: [min, max].map(|end| (end * scale - first - mean) * inverse) };
+    }
+    scales
+}
+
 /// Brings the first `n` values of some padded columns, [of safe size](make_safe), to zero mean and a deviation of their
-/// `factor` (with n, not n - 1), in place; a column of equal values becomes exactly 0. Two-pass and shifted. The padding's
-/// values mean nothing afterwards.
+/// `factor`, in place; a column of equal values becomes exactly 0. The padding's values mean nothing afterwards.
+#[cfg(test)]
 #[inline(always)]
 pub(crate) fn normalise<S: Simd, const N: usize>(
     simd: S,
@@ -142,33 +194,27 @@ pub(crate) fn normalise<S: Simd, const N: usize>(
     spans: &[Span; N],
     factors: &[f32; N],
 ) {
-    let zero = Lanes::splat(simd, 0.0);
-    let (mut first, mut mean, mut squares) = ([zero; N], [zero; N], [zero; N]);
+    let scales = center(simd, columns, n, spans);
     for k in 0..N {
-        first[k] = Lanes::splat(simd, columns[k][0]);
-        mean[k] = Lanes::splat(simd, spans[k].total / n as f32);
+        multiply(simd, columns[k], &scales[k], factors[k]);
     }
-    let length = columns[0].len();
-    for start in (0..length).step_by(LANES) {
-        for k in 0..N {
-            let place = &mut columns[k][start..start + LANES];
-            let deviation = Lanes::from_slice(simd, place) - first[k] - mean[k];
-            deviation.store_slice(place);
-            squares[k] += keep_first(simd, deviation * deviation, n - start);
-        }
+}
+
+/// Brings a padded column [of zero mean](center) to a deviation of `factor`.
+#[inline(always)]
+pub(crate) fn multiply<S: Simd>(simd: S, column: &mut [f32], scale: &Scale, factor: f32) {
+    let (inverse, factor) = (Lanes::splat(simd, scale.inverse), Lanes::splat(simd, factor));
+    for place in column.chunks_exact_mut(LANES) {
+        (Lanes::from_slice(simd, place) * inverse * factor).store_slice(place);
     }
-    let (mut inverse, mut factor) = ([zero; N], [zero; N]);
-    for k in 0..N {
-        // Of equal values not even rounding may leave anything.
-        let inverse_deviation = if spans[k].constant() { 0.0 } else { 1.0 / (sum(squares[k]) / n as f32).sqrt() };
-        (inverse[k], factor[k]) = (Lanes::splat(simd, inverse_deviation), Lanes::splat(simd, factors[k]));
-    }
-    for start in (0..length).step_by(LANES) {
-        for k in 0..N {
-            let place = &mut columns[k][start..start + LANES];
-            (Lanes::from_slice(simd, place) * inverse[k] * factor[k]).store_slice(place);
-        }
-    }
+}
+
+/// Takes two numbers away from some values, one after the other.
+#[inline(always)]
+fn shift<S: Simd>(simd: S, values: &mut [f32], [first, mean]: [f32; 2]) -> Lanes<S> {
+    let shifted = Lanes::from_slice(simd, values) - Lanes::splat(simd, first) - Lanes::splat(simd, mean);
+    shifted.store_slice(values);
+    shifted
 }
 
 #[cfg(test)]

@@ -30,15 +30,6 @@ impl Dependencies {
         }
     }
 
-    /// Gives a colour channel the dependencies of one that is equal to it.
-    pub(crate) fn copy_color(&mut self, from: usize, to: usize) {
-        self.color_position[to] = self.color_position[from];
-        self.color_random[to] = self.color_random[from];
-        if let Ok([from, to]) = self.color_features.get_disjoint_mut([from, to]) {
-            to.copy_from_slice(from);
-        }
-    }
-
     /// Adds up the colour channels' dependencies on each feature.
     pub(crate) fn add_colors(&mut self) {
         let [red, green, blue] = &self.color_features;

@@ -112,7 +112,11 @@ fn raw_columns(pass: &Pass, scratch: &Scratch) -> Columns {
 fn fast_columns(pass: &Pass, scratch: &mut Scratch) -> Columns {
     let (order, rows) = (ColumnOrder::of(pass.relevant), scratch.rows().len());
     let mut columns = |columns: std::ops::Range<usize>| {
-        columns.map(|column| f64s(&scratch.columns([column])[0][..rows])).collect::<Vec<_>>()
+        let normalised = columns.map(|column| {
+            dispatch!(SimdLevel::default().level(), simd => scratch.multiply(simd, column, 1.0));
+            f64s(&scratch.columns([column])[0][..rows])
+        });
+        normalised.collect::<Vec<_>>()
     };
     Columns {
         positions: columns(order.positions),

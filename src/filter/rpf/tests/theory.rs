@@ -1,10 +1,10 @@
 //! Stages against what theory says.
 
 use crate::filter::lanes::{LANES, SimdLevel, dispatch, padded};
-use crate::filter::rpf::information::{Histograms, entropy_terms};
+use crate::filter::rpf::information::{Histograms, entropy_terms, whole_words};
 use crate::filter::rpf::neighborhood::{Center, Offsets, candidate, offset_probabilities, pick_sample};
 use crate::filter::rpf::random::{bits, pixel_key};
-use crate::filter::rpf::statistics::{make_safe, normalise, pad};
+use crate::filter::rpf::statistics::{center, make_safe, normalise, pad};
 use crate::filter::{Rect, oracle};
 
 const BINS: u32 = 7;
@@ -18,17 +18,19 @@ fn information(x: &[f32], y: &[f32]) -> f64 {
     let n = x.len();
     let terms = entropy_terms(n);
     dispatch!(SimdLevel::default().level(), simd => {
-        let mut histograms = Histograms::with_capacity(2, padded(n), BINS, true);
+        let mut histograms = Histograms::with_capacity(2, n, BINS, true);
         histograms.start(n);
         for (column, values) in [x, y].into_iter().enumerate() {
             let mut values = values.to_vec();
-            values.resize(padded(n), 0.0);
+            values.resize(whole_words(n), 0.0);
             pad(&mut values, n);
             let spans = make_safe(simd, &mut [&mut values[..]]);
-            normalise(simd, &mut [&mut values[..]], n, &spans, &[1.0]);
-            histograms.set(simd, column, &values, spans[0].constant(), &terms);
+            let [scale] = center(simd, &mut [&mut values[..]], n, &spans);
+            histograms.set(simd, column, &values, &scale);
         }
-        histograms.information(simd, 0, &(1..2), &terms)[0]
+        histograms.finish(simd, &terms);
+        histograms.measure(simd, 0..1, 1..2, &terms);
+        histograms.information(0, &(1..2))[0]
     })
 }
 
