@@ -7,33 +7,43 @@ const DEVIATIONS: f64 = 1.0 + 1e-4;
 /// Tames the spikes of one pixel's samples (R, G, B next to each other), each channel by itself; nothing happens to
 /// pixels of fewer than 3 samples. Returns how many values were set to the mean.
 pub(crate) fn tame(samples: &mut [f32]) -> u64 {
-    let count = samples.len() / 3;
-    if count < 3 {
+    let (samples, _) = samples.as_chunks_mut::<3>();
+    if samples.len() < 3 {
         return 0;
     }
-    let mut spikes = 0;
-    for channel in 0..3 {
-        let values = || samples[channel..].iter().step_by(3).map(|&v| f64::from(v));
-        let mean = values().sum::<f64>() / count as f64;
-        let variance = values().map(|v| (v - mean) * (v - mean)).sum::<f64>() / count as f64;
-        let limit = DEVIATIONS * variance.sqrt();
-        let far = |v: f32| (f64::from(v) - mean).abs() > limit;
-        let (mut found, mut excess) = (0, 0.0);
-        for value in values().filter(|v| (v - mean).abs() > limit) {
-            found += 1;
-            excess += value - mean;
+    // The three channels side by side: the sums of one do not wait for those of another.
+    let count = samples.len() as f64;
+    let (mut mean, mut limit) = ([-0.0; 3], [0.0; 3]);
+    for sample in &*samples {
+        for k in 0..3 {
+            mean[k] += f64::from(sample[k]);
         }
-        if found == 0 {
-            continue;
+    }
+    mean = mean.map(|sum| sum / count);
+    for sample in &*samples {
+        for k in 0..3 {
+            limit[k] += (f64::from(sample[k]) - mean[k]) * (f64::from(sample[k]) - mean[k]);
         }
-        let share = excess / count as f64;
-        for value in samples[channel..].iter_mut().step_by(3) {
-            let kept = if far(*value) { mean } else { f64::from(*value) };
+    }
+    limit = limit.map(|squares| DEVIATIONS * (squares / count).sqrt());
+    let (mut found, mut excess) = ([0; 3], [0.0; 3]);
+    for sample in &*samples {
+        for k in 0..3 {
+            let off = f64::from(sample[k]) - mean[k];
+            let far = off.abs() > limit[k];
+            found[k] += u64::from(far);
+            excess[k] += if far { off } else { 0.0 };
+        }
+    }
+    for k in (0..3).filter(|&k| found[k] > 0) {
+        let share = excess[k] / count;
+        for value in samples.iter_mut().map(|sample| &mut sample[k]) {
+            let own = f64::from(*value);
+            let kept = if (own - mean[k]).abs() > limit[k] { mean[k] } else { own };
             *value = (kept + share).max(f64::from(f32::MIN)).min(f64::from(f32::MAX)) as f32;
         }
-        spikes += found;
     }
-    spikes
+    found.iter().sum()
 }
 
 #[cfg(test)]
