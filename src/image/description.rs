@@ -144,8 +144,9 @@ fn beside_samples(description: &Description) -> u64 {
         Some(known) => {
             let region = u64::from(known.region);
             let regions = most(width.div_ceil(region) * height.div_ceil(region));
-            // Of cores and halos one each; of the parts of a region the tile, and whether it is final.
-            pixels * 12 + result + base + (2 * most_cores(description.size) + 8 * regions) * record
+            // A tile that is filtered again has a file of its own on its way. Of cores and halos one record each; of the parts of a region the tile, and whether it is final.
+            let again = 12 * region * region;
+            pixels * 12 + again + result + base + (2 * most_cores(description.size) + 8 * regions) * record
         }
     }
 }

@@ -32,6 +32,9 @@ pub enum ImageError {
     /// It has as many tiles as it may have.
     #[error("an image has {MAX_TILES} tiles at most: send larger ones")]
     TooManyTiles,
+    /// Other channels than those of the tile that came first.
+    #[error("the tile's channels are not those of the tile that came first")]
+    Channels,
     /// A bare core that is too small.
     #[error(
         "tile {0} is too small: cores must have {MIN_CORE} x {MIN_CORE} pixels at least, fewer only at the image's edge"

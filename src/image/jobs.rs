@@ -1,7 +1,10 @@
 //! Filters the regions of an image whose tiles lend each other their halos.
 
 use std::{
-    sync::Arc,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
     time::{Duration, Instant},
 };
 
@@ -23,6 +26,15 @@ pub struct Job {
     pub bytes: u64,
     /// Pixels of the largest part.
     pub pixels: u64,
+    /// Whether a part is done.
+    progress: AtomicBool,
+}
+
+impl Job {
+    /// Whether a part of it was filtered, and will not be again.
+    pub fn has_progress(&self) -> bool {
+        self.progress.load(Ordering::Relaxed)
+    }
 }
 
 /// Where the time went in which a region was filtered.
@@ -61,9 +73,11 @@ impl Image {
         let (Some(neighbors), Some(announced)) = (&mut inner.neighbors, &self.description.neighbors) else {
             return Ok(None);
         };
+        // Records of tiles are set aside for eight parts of a region.
+        let pixels = pixels.max(u64::from(announced.region) * u64::from(announced.region) / 8);
         while let Some(region) = neighbors.start_next() {
             let last = neighbors.regions().last(region);
-            let mut job = Job { region, parts: Vec::new(), last, bytes: 0, pixels: 0 };
+            let mut job = Job { region, parts: Vec::new(), last, bytes: 0, pixels: 0, progress: false.into() };
             let mut rects: Vec<_> =
                 unfiltered(neighbors, &inner.stitcher, region).into_iter().map(|rect| (rect, false)).collect();
             if last {
@@ -107,18 +121,17 @@ impl Image {
     /// stopped are kept. The seed is the image's, whatever the execution says, and so is what is left out.
     pub fn run(self: &Arc<Self>, job: &Job, execution: &Execution) -> Result<Spent, ImageError> {
         let mut spent = Spent::default();
-        let done = job.parts.iter().try_for_each(|part| self.filter_part(part, job, execution, &mut spent));
+        let unfinished = Unfinished { image: self, job };
+        job.parts.iter().try_for_each(|part| self.filter_part(part, job, execution, &mut spent))?;
+        std::mem::forget(unfinished);
         let mut inner = self.write();
         let mut final_ones = Vec::new();
         if let Some(neighbors) = &mut inner.neighbors {
             neighbors.running -= 1;
-            if done.is_err() {
-                neighbors.give_back(job.region);
-            } else if job.last {
+            if job.last {
                 final_ones = neighbors.settle(job.region);
             }
         }
-        done?;
         let changes = final_ones.into_iter().map(|tile| Change::Remove(Records::Provisional, tile));
         inner.queue(changes, [After::Filtered(job.region, job.last)]);
         drop(inner);
@@ -175,7 +188,20 @@ impl Image {
         let began = Instant::now();
         self.add(claim, &filtered, started.elapsed().as_secs_f64())?;
         spent.write += began.elapsed();
+        job.progress.store(true, Ordering::Relaxed);
         Ok(())
+    }
+}
+
+/// Gives a region back that is not filtered to the end, also if that panics.
+struct Unfinished<'a> {
+    image: &'a Image,
+    job: &'a Job,
+}
+
+impl Drop for Unfinished<'_> {
+    fn drop(&mut self) {
+        self.image.give_back(self.job);
     }
 }
 

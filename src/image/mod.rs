@@ -277,10 +277,15 @@ impl Image {
             return self.keep(tile, digest);
         }
         let mut inner = self.write();
-        if inner.channels.is_none() {
-            let channels = channels_to_json(tile.channels()).to_string().into_bytes();
-            inner.queue([Change::Fact("channels", channels)], None);
-            inner.channels = Some(tile.channels().clone());
+        match &inner.channels {
+            // Of two first tiles at once, one may have been quicker.
+            Some(known) if known != tile.channels() => return Err(ImageError::Channels),
+            Some(_) => {}
+            None => {
+                let channels = channels_to_json(tile.channels()).to_string().into_bytes();
+                inner.queue([Change::Fact("channels", channels)], None);
+                inner.channels = Some(tile.channels().clone());
+            }
         }
         match inner.offer(tile.geometry().core(), digest, replace)? {
             Offer::Repeated => Ok(Outcome::Repeated),

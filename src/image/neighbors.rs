@@ -164,6 +164,8 @@ impl Neighbors {
                 this.regions.filtered(region);
             }
         }
+        // Where the samples of those were that were dropped before, there may be others now: what is in none that is needed is
+        // given back below.
         this.drop_cores(&image);
         let lent: Vec<Rect> = this.lent.iter().map(|(part, _)| part).collect();
         this.drop_lent(lent);
@@ -304,7 +306,9 @@ impl Neighbors {
         let window = self.regions.window(region);
         if last {
             self.regions.done(region);
-            self.drop_cores(&window);
+            for extent in self.drop_cores(&window) {
+                self.file.release(&extent);
+            }
         } else {
             self.regions.filtered(region);
         }
@@ -312,17 +316,19 @@ impl Neighbors {
         self.drop_lent(lent);
     }
 
-    /// Drops the samples of cores around here that no region needs.
-    fn drop_cores(&mut self, window: &Rect) {
+    /// Drops the samples of cores around here that no region needs; says where they are.
+    fn drop_cores(&mut self, window: &Rect) -> Vec<Extent> {
         let near = self.cores.meeting(window).into_iter();
         let near: Vec<Rect> = near.filter(|(_, kept)| !kept.dropped).map(|(core, _)| core).collect();
+        let mut dropped = Vec::new();
         for core in near.into_iter().filter(|core| !self.regions.need(core)) {
             if let Some(kept) = self.cores.get_mut(&core) {
                 kept.dropped = true;
                 self.room.taken = self.room.taken.saturating_sub(kept.extent.room());
-                self.file.release(&kept.extent);
+                dropped.push(kept.extent);
             }
         }
+        dropped
     }
 
     /// Drops those of these lent pixels that no region needs: all cores have come, or all regions around are done.

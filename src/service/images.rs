@@ -29,7 +29,7 @@ use super::{
     regions,
     registry::{Id, Opened, Reading, no_image},
     results::file_response,
-    work::{Stop, blocking},
+    work::blocking,
 };
 use crate::{
     admission::{AdmissionError, Permit},
@@ -408,9 +408,8 @@ pub(super) async fn result(State(service): State<Shared>, id: Id, request: Reque
     // What one has written the next need not write again.
     let entry = Arc::clone(&opened.entry);
     let _turn = entry.encoding.lock().await;
-    let stop = Stop::default();
-    let flag = stop.flag();
-    let file = blocking(move || opened.exr(&service, &options, partial, &flag)).await??;
+    let shared = Arc::clone(&service);
+    let file = service.work.picture(move |stop| opened.exr(&shared, &options, partial, stop)).await?;
     Ok(file_response(file, Form::Exr.media()).await?)
 }
 
@@ -421,14 +420,13 @@ pub(super) async fn preview(State(service): State<Shared>, id: Id, request: Requ
     let mut parameters = Parameters::of_query(request.uri())?;
     let partial = parameters.flag("partial")?;
     parameters.done("partial")?;
-    let stop = Stop::default();
-    let flag = stop.flag();
-    let file = blocking(move || {
+    let shared = Arc::clone(&service);
+    let file = service.work.picture(move |stop| {
         opened.image.flush()?;
-        opened.consistent(partial, &flag, |snapshot, _, _| {
-            let (folder, permit) = (&service.config.data_dir, service.unread.none());
+        opened.consistent(partial, stop, |snapshot, _, _| {
+            let (folder, permit) = (&shared.config.data_dir, shared.unread.none());
             write_file(folder, permit, |out| encode_png(snapshot, out)).map(Some)
         })
     });
-    Ok(file_response(file.await??, Form::Png.media()).await?)
+    Ok(file_response(file.await?, Form::Png.media()).await?)
 }

@@ -57,19 +57,7 @@ impl Opened {
 
     /// Asks whether a tile is wanted. Blocks.
     pub(super) fn offer(&self, tile: &SampleTile, replace: bool) -> Result<Outcome, Refusal> {
-        self.check_channels(tile)?;
         Ok(self.image.offer(tile, replace)?)
-    }
-
-    /// Of two first tiles at once, one may have been quicker.
-    fn check_channels(&self, tile: &SampleTile) -> Result<(), Refusal> {
-        let known = self.image.read().channels().is_none_or(|known| known == tile.channels());
-        if known {
-            return Ok(());
-        }
-        let detail = "the tile's channels are not those of the tile that came first";
-        let title = "The tile is not of this image";
-        Err(Refusal::new(StatusCode::UNPROCESSABLE_ENTITY, "channel_mismatch", title, detail))
     }
 
     /// Puts a filtered tile on the canvas and says what became of it. Blocks.

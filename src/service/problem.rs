@@ -178,6 +178,7 @@ impl From<ImageError> for Problem {
             ImageError::Stitch(error) => error.into(),
             ImageError::Finished => Self::new(409, "image_finished", "The image takes no more tiles", detail),
             ImageError::TooManyTiles => Self::new(422, "too_many_tiles", "The image has too many tiles", detail),
+            ImageError::Channels => Self::new(422, "channel_mismatch", "The tile is not of this image", detail),
             ImageError::TooSmall(_) => Self::new(422, "tile_too_small", "The tile is too small", detail),
             ImageError::SampleCount { .. } => {
                 Self::new(422, "samples_mismatch", "The tile's samples are not as announced", detail)

@@ -36,10 +36,12 @@ pub(super) async fn recover(service: Shared, found: Vec<PathBuf>) {
         if service.readiness.has(Reason::Draining) {
             return;
         }
-        let shared = Arc::clone(&service);
-        // One that panics keeps no others from being recovered.
-        if let Ok(Some(opened)) = blocking(move || shared.images.recover(&path)).await {
-            regions::kick(&service, &opened);
+        let (shared, place) = (Arc::clone(&service), path.clone());
+        match blocking(move || shared.images.recover(&place)).await {
+            Ok(Some(opened)) => regions::kick(&service, &opened),
+            Ok(None) => {}
+            // One that panics keeps no others from being recovered, and stays as it is.
+            Err(refusal) => service.images.damaged(&path, &refusal.0.detail),
         }
     }
     service.readiness.set(Reason::Recovering, false);
@@ -95,6 +97,14 @@ impl Images {
         let entry = Arc::new(Entry::new(id.clone(), owner, disk, touched, slot));
         self.lock().insert(id, Arc::clone(&entry));
         image.map(|image| Opened { entry, image })
+    }
+
+    /// Keeps the id of an image that could not even be looked at, so that nobody opens another one in its place.
+    fn damaged(&self, path: &Path, why: &str) {
+        if let Some(id) = path.file_name().and_then(|name| name.to_str()).and_then(Id::chosen) {
+            let slot = Slot::Damaged(format!("{}: {why}", path.display()));
+            self.lock().insert(id.clone(), Arc::new(Entry::new(id, None, used(path), now(), slot)));
+        }
     }
 }
 

@@ -55,9 +55,14 @@ impl Default for Runner {
 }
 
 impl Runner {
-    /// The next region is filtered in smaller parts than this one, as far as there are any.
+    /// The next region is filtered in smaller parts than this one, of which none was done in time, as far as there are any.
     fn too_long(&self, job: &Job) {
         self.pixels.fetch_min(job.pixels / 2, Ordering::Relaxed);
+    }
+
+    /// Whether nothing keeps it from going on.
+    pub(super) fn untroubled(&self) -> bool {
+        self.trouble.lock().unwrap_or_else(PoisonError::into_inner).is_none()
     }
 
     fn trouble(&self, problem: Option<Box<Problem>>) {
@@ -184,7 +189,7 @@ async fn filter(service: Shared, opened: Opened, job: Job) -> Result<(), Refusal
         let simd = shared.config.simd;
         let execution = Execution { pool: Some(pool), stop: Some(stop), simd, ..Execution::default() };
         let done = image.run(&job, &execution);
-        if let Err(ImageError::Stopped(_)) = done {
+        if let (Err(ImageError::Stopped(_)), false) = (&done, job.has_progress()) {
             // If it was not for the time, this image is not filtered any more.
             entry.runner.too_long(&job);
         }

@@ -100,6 +100,13 @@ pub(super) enum Slot {
     Gone,
 }
 
+impl Slot {
+    /// Whether a request, or the work on its regions, has it.
+    fn is_used(&self) -> bool {
+        matches!(self, Self::Open(image) if Arc::strong_count(image) > 1)
+    }
+}
+
 /// An image in memory.
 #[derive(Clone, Debug)]
 pub(super) struct Opened {
@@ -125,6 +132,11 @@ impl Entry {
 
     fn slot(&self) -> MutexGuard<'_, Slot> {
         self.slot.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether somebody is at work on it, or reads its result. Who tries in vain is not at work.
+    fn is_used(&self) -> bool {
+        self.is_read() || self.runner.untroubled() && self.slot().is_used()
     }
 
     /// Whether somebody reads the result that the image keeps, or kept.
@@ -395,22 +407,31 @@ impl Images {
         let (new, path) = (self.folder.join(format!(".new-{}", id.0)), self.folder.join(&id.0));
         remove(&new)?;
         fs::create_dir(&new)?;
-        let made = Image::create(&Directory::new(&new), description)
-            .and_then(|()| Ok(fs::rename(&new, &path)?))
-            .and_then(|()| Ok(File::open(&self.folder)?.sync_all()?))
-            .and_then(|()| Image::open(Box::new(Directory::new(&path))));
-        if made.is_err() {
-            // At the next start at the latest.
-            let _ = remove(&new).and_then(|()| remove(&path));
+        // What cannot be removed here is at the next start.
+        if let Err(error) =
+            Image::create(&Directory::new(&new), description).and_then(|()| Ok(fs::rename(&new, &path)?))
+        {
+            let _ = remove(&new);
+            return Err(error);
         }
-        made
+        let opened = File::open(&self.folder).and_then(|folder| folder.sync_all()).map_err(ImageError::from);
+        let opened = opened.and_then(|()| Image::open(Box::new(Directory::new(&path))));
+        if opened.is_err() {
+            let _ = remove(&path);
+        }
+        opened
     }
 
     /// Forgets an image. Says whether there was one. Blocks.
     pub(super) fn delete(&self, id: &Id) -> Result<bool, Refusal> {
+        self.forget(id, |_| true)
+    }
+
+    /// Forgets an image if it is to be forgotten as it is; meanwhile nobody can get hold of it.
+    fn forget(&self, id: &Id, wanted: impl FnOnce(&Slot) -> bool) -> Result<bool, Refusal> {
         let Some(entry) = self.lock().get(id).cloned() else { return Ok(false) };
         let mut slot = entry.slot();
-        if matches!(*slot, Slot::Gone) {
+        if matches!(*slot, Slot::Gone) || !wanted(&slot) {
             return Ok(false);
         }
         let gone = self.folder.join(format!(".gone-{}", Id::new().0));
@@ -429,9 +450,14 @@ impl Images {
     pub(super) fn tidy(&self) {
         let now = now();
         for entry in self.entries() {
-            if now >= self.expires(&entry) {
-                match self.delete(&entry.id) {
-                    Ok(_) => tracing::info!(id = entry.id.0, "image expired"),
+            if entry.is_used() {
+                self.touch(&entry);
+            } else if now >= self.expires(&entry) {
+                // Somebody may have come just now.
+                let unused = |_: &Slot| now >= self.expires(&entry);
+                match self.forget(&entry.id, unused) {
+                    Ok(true) => tracing::info!(id = entry.id.0, "image expired"),
+                    Ok(false) => {}
                     Err(refusal) => {
                         tracing::warn!(id = entry.id.0, problem = refusal.0.detail, "cannot forget an image")
                     }
@@ -479,7 +505,7 @@ impl Entry {
         let mut slot = self.slot();
         let Slot::Open(image) = &*slot else { return };
         // Nobody else can get hold of it meanwhile.
-        if Arc::strong_count(image) > 1 || image.failed().is_some() || !image.read().idle() {
+        if slot.is_used() || image.failed().is_some() || !image.read().idle() {
             return;
         }
         let summary = super::images::summary(&self.id, image);

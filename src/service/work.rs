@@ -20,6 +20,7 @@ use super::problem::{Refusal, internal};
 pub(super) struct Work {
     pool: Arc<ThreadPool>,
     slots: Arc<Semaphore>,
+    pictures: Arc<Semaphore>,
     jobs: usize,
     deadline: Duration,
 }
@@ -30,12 +31,29 @@ impl Work {
         let named = |i| format!("filter-{i}");
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(named).build()?;
         let jobs = threads + 1;
-        Ok(Self { pool: Arc::new(pool), slots: Arc::new(Semaphore::new(jobs)), jobs, deadline })
+        let (slots, pictures) = (Arc::new(Semaphore::new(jobs)), Arc::new(Semaphore::new(threads)));
+        Ok(Self { pool: Arc::new(pool), slots, pictures, jobs, deadline })
     }
 
     /// Jobs that run at once.
     pub(super) const fn jobs(&self) -> usize {
         self.jobs
+    }
+
+    /// Makes a picture of an image when its turn comes: as many at once as there are threads, since they take long, and
+    /// what else may wait for the disk goes on beside them. When the future is dropped the job's flag is set.
+    pub(super) async fn picture<T: Send + 'static>(
+        &self,
+        job: impl FnOnce(&AtomicBool) -> Result<T, Refusal> + Send + 'static,
+    ) -> Result<T, Refusal> {
+        let turn = Arc::clone(&self.pictures).acquire_owned().await.map_err(internal)?;
+        let stop = Stop::default();
+        let flag = stop.flag();
+        let made = blocking(move || {
+            let _turn = turn;
+            job(&flag)
+        });
+        made.await.flatten()
     }
 
     /// Runs a job when its turn comes. If it panics that is an error of this job only. When the future is dropped, or

@@ -400,6 +400,38 @@ fn a_region_that_was_stopped_is_filtered_in_parts() {
     assert!(out.into_inner() == whole_exr(&whole, &method, 5));
 }
 
+/// What was dropped stays on record; where it was, there may be others' samples after the image was opened again.
+#[test]
+fn what_is_not_needed_any_more_takes_nothing_else_with_it() {
+    const SIZE: [u32; 2] = [128, 16];
+    let (folder, method) = (tempfile::tempdir().unwrap(), Method::preset("gaussian").unwrap());
+    let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
+    let announced = Announced { channels: whole.channels().clone(), samples: 4, varying: false, region: 16 };
+    let neighbors = Some(announced);
+    let description =
+        Description { size: SIZE, method: method.clone(), seed: 5, leave_out: true, neighbors, owner: None, disk: 0 };
+    Image::create(&Directory::new(folder.path()), &description).unwrap();
+    // The last core that came is the first that is dropped; then others come into its place.
+    for cores in [&[2, 1, 0][..], &[5], &[3, 4, 6, 7], &[]] {
+        let image = Arc::new(Image::open(Box::new(Directory::new(folder.path()))).unwrap());
+        for &core in cores {
+            image.offer(&samples(SIZE, Rect::new(16 * core, 0, 16, 16), 0, 1), false).unwrap();
+            image.flush().unwrap();
+        }
+        while let Some(job) = image.next_job(1, u64::MAX, u64::MAX).unwrap() {
+            image.run(&job, &Execution::default()).unwrap();
+        }
+        image.close();
+    }
+    let image = Image::open(Box::new(Directory::new(folder.path()))).unwrap();
+    assert_eq!(image.read().regions().unwrap().open(), 0);
+    let mut out = std::io::Cursor::new(Vec::new());
+    let attributes = exr::provenance(method.preset_name(), 5, method.parameters());
+    let options = rpfd::stitch::ExrOptions { attributes, ..Default::default() };
+    image.read().stitcher().encode_exr(&options, false, &mut out).unwrap();
+    assert!(out.into_inner() == whole_exr(&whole, &method, 5));
+}
+
 #[test]
 fn regions_take_no_places_of_tiles_in_the_queue() {
     const SIZE: [u32; 2] = [256, 192];
