@@ -14,6 +14,7 @@ use rpfd::{
 use serde_json::{Value, json};
 use std::{
     os::unix::fs::MetadataExt,
+    path::Path,
     sync::{Arc, atomic::AtomicBool},
 };
 
@@ -369,17 +370,34 @@ fn a_region_that_takes_too_long_is_stopped() {
     wait_for("the work to end", || server.metric("rpfd_images_disk_bytes") == Some(0.0));
 }
 
+/// Makes an image of bare cores with regions of this side, which is to become that of these samples.
+fn create(folder: &Path, whole: &SampleTile, method: &Method, region: u32) {
+    let announced = Announced { channels: whole.channels().clone(), samples: 4, varying: false, region };
+    let (size, neighbors) = (whole.geometry().image(), Some(announced));
+    let (size, method) = ([size.width, size.height], method.clone());
+    let description = Description { size, method, seed: 5, leave_out: true, neighbors, owner: None, disk: 0 };
+    Image::create(&Directory::new(folder), &description).unwrap();
+}
+
+fn reopen(folder: &Path) -> Arc<Image> {
+    Arc::new(Image::open(Box::new(Directory::new(folder))).unwrap())
+}
+
+fn exr_of(image: &Image, method: &Method) -> Vec<u8> {
+    let mut out = std::io::Cursor::new(Vec::new());
+    let attributes = exr::provenance(method.preset_name(), 5, method.parameters());
+    let options = rpfd::stitch::ExrOptions { attributes, ..Default::default() };
+    image.read().stitcher().encode_exr(&options, false, &mut out).unwrap();
+    out.into_inner()
+}
+
 #[test]
 fn a_region_that_was_stopped_is_filtered_in_parts() {
     const SIZE: [u32; 2] = [64, 48];
     let (folder, method) = (tempfile::tempdir().unwrap(), Method::preset("lean").unwrap());
     let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
-    let announced = Announced { channels: whole.channels().clone(), samples: 4, varying: false, region: 64 };
-    let neighbors = Some(announced);
-    let description =
-        Description { size: SIZE, method: method.clone(), seed: 5, leave_out: true, neighbors, owner: None, disk: 0 };
-    Image::create(&Directory::new(folder.path()), &description).unwrap();
-    let image = Arc::new(Image::open(Box::new(Directory::new(folder.path()))).unwrap());
+    create(folder.path(), &whole, &method, 64);
+    let image = reopen(folder.path());
     image.offer(&whole, false).unwrap();
     image.flush().unwrap();
     let stop = AtomicBool::new(true);
@@ -391,13 +409,9 @@ fn a_region_that_was_stopped_is_filtered_in_parts() {
     assert_eq!(part.pixels, 32 * 24);
     let spent = image.run(&part, &Execution::default()).unwrap();
     assert!(!spent.filter.is_zero() && !spent.read.is_zero() && !spent.write.is_zero());
-    let inner = image.read();
-    assert!(inner.stitcher().tiles().count() == 4 && inner.stitcher().is_complete());
-    let mut out = std::io::Cursor::new(Vec::new());
-    let attributes = exr::provenance(method.preset_name(), 5, method.parameters());
-    let options = rpfd::stitch::ExrOptions { attributes, ..Default::default() };
-    inner.stitcher().encode_exr(&options, false, &mut out).unwrap();
-    assert!(out.into_inner() == whole_exr(&whole, &method, 5));
+    let tiles = image.read().stitcher().tiles().count();
+    assert!(tiles == 4 && image.read().stitcher().is_complete());
+    assert!(exr_of(&image, &method) == whole_exr(&whole, &method, 5));
 }
 
 /// What was dropped stays on record; where it was, there may be others' samples after the image was opened again.
@@ -406,15 +420,11 @@ fn what_is_not_needed_any_more_takes_nothing_else_with_it() {
     const SIZE: [u32; 2] = [128, 16];
     let (folder, method) = (tempfile::tempdir().unwrap(), Method::preset("gaussian").unwrap());
     let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
-    let announced = Announced { channels: whole.channels().clone(), samples: 4, varying: false, region: 16 };
-    let neighbors = Some(announced);
-    let description =
-        Description { size: SIZE, method: method.clone(), seed: 5, leave_out: true, neighbors, owner: None, disk: 0 };
-    Image::create(&Directory::new(folder.path()), &description).unwrap();
+    create(folder.path(), &whole, &method, 16);
     // The last core that came is the first that is dropped; then others come into its place, after some new starts, since
     // each leaves room behind it.
     for cores in [&[2, 1, 0][..], &[5], &[7], &[3], &[4, 6], &[]] {
-        let image = Arc::new(Image::open(Box::new(Directory::new(folder.path()))).unwrap());
+        let image = reopen(folder.path());
         for &core in cores {
             image.offer(&samples(SIZE, Rect::new(16 * core, 0, 16, 16), 0, 1), false).unwrap();
             image.flush().unwrap();
@@ -424,13 +434,9 @@ fn what_is_not_needed_any_more_takes_nothing_else_with_it() {
         }
         image.close();
     }
-    let image = Image::open(Box::new(Directory::new(folder.path()))).unwrap();
+    let image = reopen(folder.path());
     assert_eq!(image.read().regions().unwrap().open(), 0);
-    let mut out = std::io::Cursor::new(Vec::new());
-    let attributes = exr::provenance(method.preset_name(), 5, method.parameters());
-    let options = rpfd::stitch::ExrOptions { attributes, ..Default::default() };
-    image.read().stitcher().encode_exr(&options, false, &mut out).unwrap();
-    assert!(out.into_inner() == whole_exr(&whole, &method, 5));
+    assert!(exr_of(&image, &method) == whole_exr(&whole, &method, 5));
 }
 
 #[test]
