@@ -144,7 +144,8 @@ fn beside_samples(description: &Description) -> u64 {
         Some(known) => {
             let region = u64::from(known.region);
             let regions = most(width.div_ceil(region) * height.div_ceil(region));
-            // A tile that is filtered again has a file of its own on its way. Of cores and halos one record each; of the parts of a region the tile, and whether it is final.
+            // Of cores and halos one record each; of the parts of a region the tile, and whether it is final. A tile that
+            // is filtered again has a file of its own on its way.
             let again = 12 * region * region;
             pixels * 12 + again + result + base + (2 * most_cores(description.size) + 8 * regions) * record
         }

@@ -55,7 +55,8 @@ impl Default for Runner {
 }
 
 impl Runner {
-    /// The next region is filtered in smaller parts than this one, of which none was done in time, as far as there are any.
+    /// The next region is filtered in smaller parts than this one, of which none was done in time, as far as there are
+    /// any.
     fn too_long(&self, job: &Job) {
         self.pixels.fetch_min(job.pixels / 2, Ordering::Relaxed);
     }

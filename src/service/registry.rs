@@ -135,8 +135,8 @@ impl Entry {
     }
 
     /// Whether somebody is at work on it, or reads its result. Who tries in vain is not at work.
-    fn is_used(&self) -> bool {
-        self.is_read() || self.runner.untroubled() && self.slot().is_used()
+    fn is_used(&self, slot: &Slot) -> bool {
+        self.is_read() || self.runner.untroubled() && slot.is_used()
     }
 
     /// Whether somebody reads the result that the image keeps, or kept.
@@ -316,8 +316,8 @@ impl Images {
         let _ = file.and_then(|file| file.set_modified(UNIX_EPOCH + Duration::from_secs(entry.touched())));
     }
 
-    /// Opens an image, of which its owner may have so many, unless there is one with its id: says whether it is new, and gives the one that is there now.
-    /// Blocks.
+    /// Opens an image, of which its owner may have so many, unless there is one with its id: says whether it is new, and
+    /// gives the one that is there now. Blocks.
     pub(super) fn open(&self, id: Id, description: Description, limit: usize) -> Result<(bool, Opened), Refusal> {
         let (owner, disk) = (description.owner.clone(), description.disk);
         let entry = Arc::new(Entry::new(id.clone(), owner, disk, now(), Slot::Gone));
@@ -450,12 +450,12 @@ impl Images {
     pub(super) fn tidy(&self) {
         let now = now();
         for entry in self.entries() {
-            if entry.is_used() {
+            let used = entry.is_used(&entry.slot());
+            if used {
                 self.touch(&entry);
             } else if now >= self.expires(&entry) {
                 // Somebody may have come just now.
-                let unused = |_: &Slot| now >= self.expires(&entry);
-                match self.forget(&entry.id, unused) {
+                match self.forget(&entry.id, |slot| now >= self.expires(&entry) && !entry.is_used(slot)) {
                     Ok(true) => tracing::info!(id = entry.id.0, "image expired"),
                     Ok(false) => {}
                     Err(refusal) => {

@@ -22,6 +22,16 @@ fn unlimit(server: &Server) {
     assert!(Command::new("prlimit").args(["--pid", &pid, "--fsize=unlimited"]).status().unwrap().success());
 }
 
+const SIZE: [u32; 2] = [96, 96];
+
+/// What opens an image, and the halo that its tiles then bring.
+fn openings() -> [(u32, Vec<u8>); 2] {
+    [
+        (17, br#"{"width": 96, "height": 96, "id": "a", "seed": 5, "preset": "lean"}"#.to_vec()),
+        (0, neighbors::opening("a", SIZE, "lean", ("samples", 4))),
+    ]
+}
+
 #[test]
 fn a_full_disk_refuses_tiles_and_the_image_stays_usable() {
     if Command::new("prlimit").arg("--version").output().is_err() {
@@ -29,13 +39,9 @@ fn a_full_disk_refuses_tiles_and_the_image_stays_usable() {
         println!("skipped: prlimit is not there");
         return;
     }
-    const SIZE: [u32; 2] = [96, 96];
     let method = Method::preset("lean").unwrap();
     let expected = whole_exr(&samples(SIZE, Rect::new(0, 0, 96, 96), 0, 1), &method, 5);
-    for (halo, opening) in [
-        (17, br#"{"width": 96, "height": 96, "id": "a", "seed": 5, "preset": "lean"}"#.to_vec()),
-        (0, neighbors::opening("a", SIZE, "lean", ("samples", 4))),
-    ] {
+    for (halo, opening) in openings() {
         let server = Server::start(&[]);
         assert_eq!(server.post("/v1/images", &opening).status, 201);
         let cores: Vec<Rect> = tiling(SIZE, 32).collect();
@@ -86,13 +92,9 @@ fn mounted(bytes: u64) -> Option<Server> {
 
 #[test]
 fn a_full_file_system_refuses_tiles_and_the_image_stays_usable() {
-    const SIZE: [u32; 2] = [96, 96];
     let method = Method::preset("lean").unwrap();
     let expected = whole_exr(&samples(SIZE, Rect::new(0, 0, 96, 96), 0, 1), &method, 5);
-    for (halo, opening) in [
-        (17, br#"{"width": 96, "height": 96, "id": "a", "seed": 5, "preset": "lean"}"#.to_vec()),
-        (0, neighbors::opening("a", SIZE, "lean", ("samples", 4))),
-    ] {
+    for (halo, opening) in openings() {
         let Some(server) = mounted(32 << 20) else { return };
         assert_eq!(server.get("/readyz").status, 200);
         assert_eq!(server.post("/v1/images", &opening).status, 201);

@@ -1,9 +1,9 @@
 //! What an image has survives: kills, new starts, damaged files, a full disk. Images end when nobody uses them.
 
-use super::{Server, encode, exact::whole_exr, neighbors, samples, tile, wait_for};
+use super::{Answer, Server, encode, exact::whole_exr, head, neighbors, samples, tile, wait_for};
 use rpfd::filter::{Method, Rect};
 use serde_json::json;
-use std::process::Command;
+use std::{io::Write, process::Command};
 
 const SIZE: [u32; 2] = [32, 16];
 const LEFT: Rect = Rect::new(0, 0, 16, 16);
@@ -193,6 +193,24 @@ fn images_that_nobody_uses_expire() {
     server.get("/v1/images/a").problem(404, "unknown_image");
     // It is forgotten first, and its files are removed then.
     wait_for("its files to be gone", || std::fs::read_dir(server.data_dir().join("images")).unwrap().count() == 0);
+}
+
+#[test]
+fn images_that_somebody_is_at_work_on_do_not_expire() {
+    let server = Server::start(&["--image-ttl", "1"]);
+    open(&server, "a");
+    let body = tile(SIZE, LEFT, 0);
+    let mut stream = server.connect();
+    stream.write_all(head("POST", "/v1/images/a/tiles", &[], body.len()).as_bytes()).unwrap();
+    stream.write_all(&body[..body.len() / 2]).unwrap();
+    // The list is no use of it, and this stream began long before.
+    let expires = || server.get("/v1/images").json()["images"][0]["expires"].as_u64();
+    let first = expires().unwrap();
+    wait_for("three times its time", || expires().expect("the image is there") > first + 3);
+    stream.write_all(&body[body.len() / 2..]).unwrap();
+    assert_eq!(Answer::read(&mut stream).lines()[0]["state"], "filtered");
+    drop(stream);
+    wait_for("the image to expire", || expires().is_none());
 }
 
 #[test]

@@ -28,9 +28,10 @@ impl Span {
     }
 }
 
-/// Replaces missing values (NaN) among the first `n` of a padded column by the mean of the others, so that they stand in the middle: z = 0. If all are missing
-/// they become 0. A column with missing values is shifted to its first value and scaled by a power of two, which
-/// normalising does not see: far from the origin the mean itself would be rounded away from the middle.
+/// Replaces missing values (NaN) among the first `n` of a padded column by the mean of the others, so that they stand in
+/// the middle: z = 0. If all are missing they become 0. A column with missing values is shifted to its first value and
+/// scaled by a power of two, which normalising does not see: far from the origin the mean itself would be rounded away
+/// from the middle.
 #[inline(always)]
 pub(crate) fn impute<S: Simd>(simd: S, column: &mut [f32], n: usize) {
     column[n..].fill(f32::NAN);
