@@ -4,7 +4,7 @@ use super::bilateral::{self, Distances};
 use super::block::{Block, ColumnOrder};
 use super::cluster::Cluster;
 use super::information::{Histograms, whole_words};
-use super::neighborhood::{Center, Offsets, gather_rows};
+use super::neighborhood::{Around, Center, Draws, Offsets};
 use super::params::Params;
 use super::relevance::Relevant;
 use super::statistics::{Scale, Span, center, impute, make_safe, multiply};
@@ -47,6 +47,7 @@ pub(crate) struct Scratch {
     /// The samples around the pixels that are worked on.
     pub(super) block: Block,
     cluster: Cluster,
+    draws: Draws,
     /// The neighbourhood: the first `count` are records of the block, the rest fills up whole lanes.
     rows: Vec<u32>,
     pub(super) count: usize,
@@ -79,6 +80,7 @@ impl Scratch {
         Self {
             block: Block::with_capacity(room.pixels, room.samples, tile, &order),
             cluster: Cluster::new(features, params),
+            draws: Draws::with_capacity(room.rows),
             rows: vec![0; stride],
             count: 0,
             columns: vec![0.0; columns * stride],
@@ -108,6 +110,7 @@ impl Scratch {
             + Histograms::bytes(columns, stride, bins)
             + Block::bytes(room.pixels, room.samples, varying, order)
             + Cluster::bytes(features)
+            + Draws::bytes(room.rows)
     }
 
     /// The neighbourhood, as records of the block.
@@ -208,15 +211,20 @@ impl Pass<'_> {
     /// Draws the neighbourhood of a pixel; false if it has no samples.
     #[inline(always)]
     pub(super) fn gather<S: Simd>(&self, simd: S, scratch: &mut Scratch, x: u32, y: u32) -> bool {
-        let Scratch { block, cluster, rows, count, .. } = scratch;
+        let Scratch { block, cluster, draws, rows, count, .. } = scratch;
         let own = block.samples_of(x, y);
         if own.is_empty() {
             return false;
         }
         let key = random::pixel_key(self.execution.seed, x, y, self.t);
         let center = Center { x, y, key, wanted: self.params.neighbors(self.t, own.len()) };
-        cluster.set(simd, block, own);
-        *count = gather_rows(simd, rows, &self.tile.geometry().image(), block, &self.offsets, cluster, &center);
+        cluster.set(simd, block, own.clone());
+        for (row, sample) in rows.iter_mut().zip(own.clone()) {
+            *row = sample as u32;
+        }
+        let image = self.tile.geometry().image();
+        let around = Around { image: &image, block, offsets: &self.offsets, center: &center };
+        *count = cluster.keep(simd, block, draws.make(simd, &around, own.len()), rows, own.len());
         let first = rows[0];
         rows[*count..padded(*count)].fill(first);
         true

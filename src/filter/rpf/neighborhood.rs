@@ -6,56 +6,44 @@
 //! in any feature is rejected.
 
 use super::block::Block;
-use super::cluster::Cluster;
 use super::random;
 use crate::filter::geometry::Rect;
-use crate::filter::lanes::{Integers, LANES, Simd, prelude::*};
+use crate::filter::lanes::{Integers, LANES, Signed, Simd, prelude::*};
 use crate::filter::samples::SampleLayout;
 use std::ops::Range;
 
 /// Tries within one draw before it is dropped.
 const TRIES: u64 = 8;
-/// Draws whose bits are made at once.
-const DRAWS: usize = 32;
+/// Draws whose first tries are made at once.
+const FIRST: usize = 32;
+/// Draws that are tried again at once: few fail.
+const AGAIN: usize = LANES;
 /// Slots of the alias table: a power of two above the widest box.
 const SLOTS: usize = 256;
-/// Parts of a slot that have an offset each, unless the two that the slot stands for meet there.
-const PARTS: usize = 16;
 
 /// Offsets along one axis: a Gaussian with sigma = box / 4, rounded to whole pixels and held inside the box, as a table
 /// for Walker's alias method in Vose's form (1991). The two axes are independent, so one table serves both.
 #[derive(Clone, Debug)]
 pub struct Offsets {
-    /// Of each slot: the share (of 65536) in which it stands for `own`, else for `other`.
-    slots: Box<[Slot; SLOTS]>,
-    /// The offset of each part of each slot, `[part][slot]`, where it is one: nearly everywhere.
-    parts: Box<[i8; PARTS * SLOTS]>,
-}
-
-/// In place of the offset of a part that has two.
-const EITHER: i8 = i8::MIN;
-
-#[derive(Clone, Copy, Debug, Default)]
-struct Slot {
-    share: u32,
-    /// `other`, then `own`.
-    offsets: [i16; 2],
+    /// Of each slot, from the high bits down: the share (of 65536) in which it stands for one offset, in 16 bits; that
+    /// offset, and the other one, in 8 bits each.
+    slots: Box<[u32; SLOTS]>,
 }
 
 impl Offsets {
     /// The table for one box width.
     pub fn new(width: u32) -> Self {
-        let radius = (width / 2) as i16;
+        let radius = (width / 2) as i32;
         let probabilities: Vec<f64> = offset_probabilities(width);
         // Vose: slots that hold too little are topped up from one that holds too much.
         let mut left: Vec<f64> = (0..SLOTS).map(|i| probabilities.get(i).map_or(0.0, |p| p * SLOTS as f64)).collect();
-        let offset = |slot: usize| slot as i16 - radius;
-        let mut slots = Box::new([Slot::default(); SLOTS]);
+        let offset = |slot: usize| slot as i32 - radius;
+        let mut slots = Box::new([0; SLOTS]);
         let (mut small, mut large): (Vec<usize>, Vec<usize>) = (0..SLOTS).partition(|&i| left[i] < 1.0);
         while let Some(&high) = large.last() {
             let Some(low) = small.pop() else { break };
             let share = libm::round(left[low] * 65536.0) as u32;
-            slots[low] = Slot { share, offsets: [offset(high), offset(low)] };
+            slots[low] = slot(share, offset(low), offset(high));
             left[high] -= 1.0 - f64::from(share) / 65536.0;
             if left[high] < 1.0 {
                 large.pop();
@@ -64,48 +52,38 @@ impl Offsets {
         }
         // What remains holds 1, but for rounding.
         for full in small.into_iter().chain(large) {
-            slots[full] = Slot { share: 65536, offsets: [offset(full); 2] };
+            slots[full] = slot(65536, offset(full), offset(full));
         }
-        let mut parts = Box::new([EITHER; PARTS * SLOTS]);
-        for (index, place) in parts.iter_mut().enumerate() {
-            let (slot, start) = (slots[index % SLOTS], (index / SLOTS * 65536 / PARTS) as u32);
-            let [other, own] = slot.offsets;
-            let end = start + (65536 / PARTS) as u32;
-            *place = if slot.share <= start {
-                other as i8
-            } else if slot.share >= end {
-                own as i8
-            } else {
-                *place
-            };
-        }
-        Self { slots, parts }
+        Self { slots }
     }
 
-    /// Where [`Offsets::parts`] has the offset for 24 random bits: their slot, and the first bits of their fraction.
+    /// The slot for 24 random bits.
     #[inline(always)]
-    const fn part(bits: u64) -> u16 {
-        (bits & 0xFF | bits >> 12 & 0xF00) as u16
+    const fn slot(&self, bits: u32) -> u32 {
+        self.slots[bits as usize % SLOTS]
     }
 
-    /// The offset that a part has, or [`EITHER`].
+    /// The offsets for 24 random bits each, with their [slots](Offsets::slot).
     #[inline(always)]
-    fn of_part(&self, part: u16) -> u32 {
-        i32::from(self.parts[usize::from(part) % (PARTS * SLOTS)]) as u32
+    fn pick<S: Simd>(slots: Integers<S>, bits: Integers<S>) -> Integers<S> {
+        let own = ((bits >> 8) & 0xFFFF).simd_lt(slots >> 16);
+        let offsets = own.select(slots >> 8, slots) << 24;
+        (offsets.bitcast::<Signed<S>>() >> 24).bitcast()
     }
 
-    /// The offsets in x and y for 48 random bits.
-    fn both(&self, bits: u64) -> (i32, i32) {
-        (self.pick(bits), self.pick(bits >> 24))
+    /// The same for one, without lanes.
+    const fn pick_one(&self, bits: u32) -> i32 {
+        let slot = self.slot(bits);
+        let offset = if bits >> 8 & 0xFFFF < slot >> 16 { slot >> 8 } else { slot };
+        offset as i8 as i32
     }
+}
 
-    /// The offset for 24 random bits.
-    fn pick(&self, bits: u64) -> i32 {
-        let slot = &self.slots[bits as usize % SLOTS];
-        let fraction = (bits >> 8) as u32 & 0xFFFF;
-        // A lookup rather than a branch, which could not be foretold.
-        i32::from(slot.offsets[usize::from(fraction < slot.share)])
-    }
+/// A slot of [`Offsets`] that stands for the offset `own` in its share, else for `other`.
+const fn slot(share: u32, own: i32, other: i32) -> u32 {
+    // All of it would be one too many for 16 bits.
+    let other = if share >> 16 == 0 { other } else { own };
+    share << 16 | (own as u32 & 0xFF) << 8 | other as u32 & 0xFF
 }
 
 /// Probability of each offset of an axis, from -width/2 to width/2.
@@ -131,135 +109,147 @@ pub(crate) struct Center {
     pub(crate) wanted: usize,
 }
 
-/// Fills `rows` with the records of a neighbourhood, those of the pixel's own samples first, and says how many they
-/// are. `rows` has room for the wanted number; the pixel has samples.
-#[inline(always)]
-pub(crate) fn gather_rows<S: Simd>(
-    simd: S,
-    rows: &mut [u32],
-    image: &Rect,
-    block: &Block,
-    offsets: &Offsets,
-    cluster: &Cluster,
-    center: &Center,
-) -> usize {
-    let own = block.samples_of(center.x, center.y);
-    let mut kept = own.len();
-    for (row, sample) in rows.iter_mut().zip(own) {
-        *row = sample as u32;
-    }
-    let mut drawn = [0; DRAWS];
-    let draws = center.wanted.saturating_sub(kept) as u64;
-    for first in (0..draws).step_by(DRAWS) {
-        let last = draws.min(first + DRAWS as u64);
-        let count = draw(simd, image, block, offsets, center, first..last, &mut drawn);
-        kept = cluster.keep(simd, block, &drawn[..count], rows, kept);
-    }
-    kept
+/// The draws around one pixel.
+#[derive(Debug)]
+pub(crate) struct Draws {
+    /// The records they end at, or [`NOWHERE`]; whole batches.
+    records: Vec<u32>,
+    /// Those that have not ended yet.
+    unfinished: Vec<u32>,
 }
 
-/// Makes some of a pixel's draws, [`DRAWS`] at most; `drawn` then starts with the records they end at, and they are so
-/// many.
-#[inline(always)]
-fn draw<S: Simd>(
-    simd: S,
-    image: &Rect,
-    block: &Block,
-    offsets: &Offsets,
-    center: &Center,
-    draws: Range<u64>,
-    drawn: &mut [u32; DRAWS],
-) -> usize {
-    let Pixels { pixels, picks, mut missed } = draw_pixels(simd, image, block.window(), offsets, center, draws.clone());
-    let count = (draws.end - draws.start) as usize;
-    let places = drawn.iter_mut().zip(pixels.iter().zip(&picks));
-    match block.layout() {
-        SampleLayout::Uniform { per_pixel, .. } => {
-            for (place, (&pixel, &pick)) in places {
-                *place = pixel * per_pixel + pick_of(pick, *per_pixel);
+/// In place of the record of a draw that is dropped.
+const NOWHERE: u32 = u32::MAX;
+
+impl Draws {
+    /// Room for so many rows.
+    pub(crate) fn with_capacity(rows: usize) -> Self {
+        Self { records: vec![0; rows.next_multiple_of(FIRST)], unfinished: Vec::with_capacity(rows) }
+    }
+
+    /// Bytes that [`Draws::with_capacity`] allocates.
+    pub(crate) const fn bytes(rows: usize) -> u64 {
+        ((rows.next_multiple_of(FIRST) + rows) * size_of::<u32>()) as u64
+    }
+
+    /// Makes the draws around a pixel that has so many samples, and gives the records that they end at, in order.
+    #[inline(always)]
+    pub(crate) fn make<S: Simd>(&mut self, simd: S, around: &Around, own: usize) -> &[u32] {
+        let Self { records, unfinished } = self;
+        let count = around.center.wanted.saturating_sub(own);
+        unfinished.clear();
+        let mut dropped = false;
+        for (first, batch) in (0..count).step_by(FIRST).zip(records.as_chunks_mut::<FIRST>().0) {
+            // All of them, wanted or not: a fixed number of them the compiler puts into lanes.
+            let tries = around.attempt::<S, FIRST>(simd, |index| (first + index) as u64 * TRIES);
+            *batch = tries.records;
+            let wanted = u64::MAX >> (u64::BITS as usize - FIRST.min(count - first));
+            dropped |= tries.dropped & wanted != 0;
+            let mut failed = tries.failed & wanted;
+            while failed != 0 {
+                unfinished.push(first as u32 + failed.trailing_zeros());
+                failed &= failed - 1;
             }
         }
-        SampleLayout::Varying { starts } => {
-            for (draw, (place, (&pixel, &pick))) in places.enumerate().take(count) {
-                let (start, end) = (starts[pixel as usize], starts[pixel as usize + 1]);
-                *place = start + pick_of(pick, end - start);
-                missed |= u64::from(start == end) << draw;
+        for attempt in 1..TRIES {
+            let mut left = 0;
+            for start in (0..unfinished.len()).step_by(AGAIN) {
+                let mut batch = [0; AGAIN];
+                let number = AGAIN.min(unfinished.len() - start);
+                batch[..number].copy_from_slice(&unfinished[start..start + number]);
+                let tries = around.attempt::<S, AGAIN>(simd, |index| u64::from(batch[index]) * TRIES + attempt);
+                dropped |= tries.dropped != 0;
+                for (index, &draw) in batch[..number].iter().enumerate() {
+                    records[draw as usize] = tries.records[index];
+                    unfinished[left] = draw;
+                    left += usize::from(tries.failed >> index & 1 != 0);
+                }
+            }
+            unfinished.truncate(left);
+        }
+        dropped |= !unfinished.is_empty();
+        if !dropped {
+            return &records[..count];
+        }
+        for &draw in &*unfinished {
+            records[draw as usize] = NOWHERE;
+        }
+        let mut kept = 0;
+        for draw in 0..count {
+            records[kept] = records[draw];
+            kept += usize::from(records[draw] != NOWHERE);
+        }
+        &records[..kept]
+    }
+}
+
+/// What some tries end at.
+struct Tries<const N: usize> {
+    /// Of each the record, or [`NOWHERE`].
+    records: [u32; N],
+    /// A bit for each that has to be made again.
+    failed: u64,
+    /// A bit for each whose draw is dropped: it ends where there are no samples.
+    dropped: u64,
+}
+
+/// What draws are made around.
+pub(crate) struct Around<'a> {
+    pub(crate) image: &'a Rect,
+    pub(crate) block: &'a Block,
+    pub(crate) offsets: &'a Offsets,
+    pub(crate) center: &'a Center,
+}
+
+impl Around<'_> {
+    /// Makes some tries, in lanes.
+    #[inline(always)]
+    fn attempt<S: Simd, const N: usize>(&self, simd: S, counter: impl Fn(usize) -> u64) -> Tries<N> {
+        let Self { image, block, offsets, center } = *self;
+        let (window, layout) = (block.window(), block.layout());
+        let per_pixel = if let SampleLayout::Uniform { per_pixel, .. } = layout { *per_pixel } else { 0 };
+        let (mut bits, mut picks, mut slots) = ([[0; N]; 2], [0; N], [[0; N]; 2]);
+        for index in 0..N {
+            let random = random::bits(center.key, counter(index));
+            (bits[0][index], bits[1][index]) = (random as u32, (random >> 24) as u32);
+            let pick = (random::mix(random) >> 32) as u32;
+            picks[index] = if per_pixel > 0 { pick_of(pick, per_pixel) } else { pick };
+        }
+        for axis in 0..2 {
+            for index in 0..N {
+                slots[axis][index] = offsets.slot(bits[axis][index]);
             }
         }
-    }
-    if missed == 0 {
-        return count;
-    }
-    let mut kept = 0;
-    for draw in (0..count).filter(|draw| missed >> draw & 1 == 0) {
-        drawn[kept] = drawn[draw];
-        kept += 1;
-    }
-    kept
-}
-
-/// What some draws end at.
-struct Pixels {
-    /// Pixels (indices in the data window).
-    pixels: [u32; DRAWS],
-    /// Random bits to pick one of their samples by.
-    picks: [u32; DRAWS],
-    /// A bit for each draw that ends nowhere.
-    missed: u64,
-}
-
-/// The pixels that some draws end at.
-#[inline(always)]
-fn draw_pixels<S: Simd>(
-    simd: S,
-    image: &Rect,
-    window: &Rect,
-    offsets: &Offsets,
-    center: &Center,
-    draws: Range<u64>,
-) -> Pixels {
-    let (mut pixels, mut picks) = ([0; DRAWS], [0; DRAWS]);
-    let count = (draws.end - draws.start) as usize;
-    let (mut bits, mut parts) = ([0; DRAWS], [[0; DRAWS]; 2]);
-    let (mut dx, mut dy) = ([0; DRAWS], [0; DRAWS]);
-    // All of them, wanted or not: a fixed number of them the compiler puts into lanes.
-    for index in 0..DRAWS {
-        bits[index] = random::bits(center.key, (draws.start + index as u64) * TRIES);
-        picks[index] = (random::mix(bits[index]) >> 32) as u32;
-        (parts[0][index], parts[1][index]) = (Offsets::part(bits[index]), Offsets::part(bits[index] >> 24));
-    }
-    for index in 0..DRAWS {
-        (dx[index], dy[index]) = (offsets.of_part(parts[0][index]), offsets.of_part(parts[1][index]));
-    }
-    // The first try, which mostly is the last, in lanes.
-    let (x, y) = (lanes(simd, center.x - window.x), lanes(simd, center.y - window.y));
-    let (width, height) = (lanes(simd, window.width), lanes(simd, window.height));
-    let (none, either) = (lanes(simd, 0), lanes(simd, i32::from(EITHER) as u32));
-    let mut done = 0;
-    for start in (0..DRAWS).step_by(LANES) {
-        let dx = Integers::from_slice(simd, &dx[start..start + LANES]);
-        let dy = Integers::from_slice(simd, &dy[start..start + LANES]);
-        let (x, y) = (x + dx, y + dy);
-        let undone = dx.simd_eq(either) | dy.simd_eq(either) | (dx | dy).simd_eq(none);
-        let here = x.simd_lt(width) & y.simd_lt(height) & !undone;
-        here.select(y * width + x, none).store_slice(&mut pixels[start..start + LANES]);
-        done |= here.to_bitmask() << start;
-    }
-    let (mut undone, mut missed) = (!done & u64::MAX >> (u64::BITS as usize - count), 0);
-    while undone != 0 {
-        let draw = undone.trailing_zeros() as usize;
-        undone &= undone - 1;
-        match candidate(image, window, offsets, center, draws.start + draw as u64) {
-            Some((pixel, bits)) => (pixels[draw], picks[draw]) = (pixel as u32, (random::mix(bits) >> 32) as u32),
-            None => missed |= 1 << draw,
+        let lanes = |value: u32| Integers::splat(simd, value);
+        let mut tries = Tries { records: [0; N], failed: 0, dropped: 0 };
+        for start in (0..N).step_by(LANES) {
+            let at = |values: &[u32; N]| Integers::from_slice(simd, &values[start..start + LANES]);
+            let dx = Offsets::pick(at(&slots[0]), at(&bits[0]));
+            let dy = Offsets::pick(at(&slots[1]), at(&bits[1]));
+            // What would be below 0 is a great number.
+            let (x, y) = (lanes(center.x) + dx, lanes(center.y) + dy);
+            let inside = x.simd_lt(lanes(image.width)) & y.simd_lt(lanes(image.height));
+            let (x, y) = (x - lanes(window.x), y - lanes(window.y));
+            let here = x.simd_lt(lanes(window.width)) & y.simd_lt(lanes(window.height));
+            let pixel = y * lanes(window.width) + x;
+            let record = if per_pixel > 0 { pixel * lanes(per_pixel) + at(&picks) } else { pixel };
+            here.select(record, lanes(NOWHERE)).store_slice(&mut tries.records[start..start + LANES]);
+            let failed = (!inside | (dx | dy).simd_eq(lanes(0))).to_bitmask();
+            tries.failed |= failed << start;
+            tries.dropped |= (!here).to_bitmask() << start;
         }
+        if let SampleLayout::Varying { starts } = layout {
+            for (index, (record, &pick)) in tries.records.iter_mut().zip(&picks).enumerate() {
+                if *record != NOWHERE {
+                    let (start, end) = (starts[*record as usize], starts[*record as usize + 1]);
+                    *record = if start < end { start + pick_of(pick, end - start) } else { NOWHERE };
+                    tries.dropped |= u64::from(start == end) << index;
+                }
+            }
+        }
+        tries.dropped &= !tries.failed;
+        tries
     }
-    Pixels { pixels, picks, missed }
-}
-
-#[inline(always)]
-fn lanes<S: Simd>(simd: S, value: u32) -> Integers<S> {
-    Integers::splat(simd, value)
 }
 
 /// One of so many, for 32 random bits.
@@ -284,7 +274,7 @@ pub(super) fn candidate(
 ) -> Option<(usize, u64)> {
     for attempt in 0..TRIES {
         let bits = random::bits(center.key, draw * TRIES + attempt);
-        let (dx, dy) = offsets.both(bits);
+        let (dx, dy) = (offsets.pick_one(bits as u32), offsets.pick_one((bits >> 24) as u32));
         let (Some(x), Some(y)) = (center.x.checked_add_signed(dx), center.y.checked_add_signed(dy)) else { continue };
         if (dx, dy) != (0, 0) && image.contains(x, y) {
             return window.contains(x, y).then(|| (window.index(x, y), bits));
