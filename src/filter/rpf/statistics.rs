@@ -35,15 +35,17 @@ impl Span {
 #[inline(always)]
 pub(crate) fn impute<S: Simd>(simd: S, column: &mut [f32], n: usize) {
     column[n..].fill(f32::NAN);
-    let (zero, none) = (Lanes::splat(simd, 0.0), [Wide::splat(simd, 0.0); 2]);
-    let (mut present, mut size, mut total) = (0, zero, none);
+    let (zero, one, none) = (Lanes::splat(simd, 0.0), Lanes::splat(simd, 1.0), [Wide::splat(simd, 0.0); 2]);
+    let (mut present, mut size, mut total) = (zero, zero, none);
     for chunk in column.chunks_exact(LANES) {
         let values = Lanes::from_slice(simd, chunk);
         let there = values.simd_eq(values);
-        present += there.to_bitmask().count_ones() as usize;
+        present += there.select(one, zero);
         size = size.max(there.select(values.abs(), zero));
     }
-    if present == n {
+    // Whole numbers far below 2^24.
+    let present = sum(present);
+    if present == n as f32 {
         pad(column, n);
         return;
     }
@@ -53,18 +55,15 @@ pub(crate) fn impute<S: Simd>(simd: S, column: &mut [f32], n: usize) {
     };
     let scale = safe_scale(size.reduce_max());
     let (scale, first) = (Lanes::splat(simd, scale), Lanes::splat(simd, first * scale));
-    for chunk in column.chunks_exact_mut(LANES) {
+    for chunk in column.chunks_exact(LANES) {
         let values = Lanes::from_slice(simd, chunk);
-        let shifted = values * scale - first;
-        shifted.store_slice(chunk);
-        let there = values.simd_eq(values);
-        let (low, high) = there.select(shifted, zero).widen();
+        let (low, high) = values.simd_eq(values).select(values * scale - first, zero).widen();
         total = [total[0] + low, total[1] + high];
     }
-    let mean = Lanes::splat(simd, ((total[0] + total[1]).to_array().iter().sum::<f64>() / present as f64) as f32);
+    let mean = Lanes::splat(simd, ((total[0] + total[1]).to_array().iter().sum::<f64>() / f64::from(present)) as f32);
     for chunk in column.chunks_exact_mut(LANES) {
         let values = Lanes::from_slice(simd, chunk);
-        values.simd_eq(values).select(values, mean).store_slice(chunk);
+        values.simd_eq(values).select(values * scale - first, mean).store_slice(chunk);
     }
     pad(column, n);
 }
