@@ -53,41 +53,16 @@ impl Cluster {
         }
     }
 
-    /// Appends to the first `kept` of `rows` those of some records whose features are all inside, in order; says how many
-    /// there are then.
+    /// Moves those of some records forward, in order, whose features are all inside; says how many they are.
     #[inline(always)]
-    pub(crate) fn keep<S: Simd>(
-        &self,
-        simd: S,
-        block: &Block,
-        records: &[u32],
-        rows: &mut [u32],
-        mut kept: usize,
-    ) -> usize {
-        let (features, lines) = (block.features(), self.lines.len());
-        // No branch on what is inside: it could not be foretold.
-        if let [interval] = &self.lines[..] {
+    pub(crate) fn keep<S: Simd>(&self, simd: S, block: &Block, records: &mut [u32]) -> usize {
+        let mut kept = records.len();
+        for (line, interval) in self.lines.iter().enumerate() {
             let bounds = Bounds::of(simd, interval);
-            if interval.missing == 0 {
-                for &record in records {
-                    rows[kept] = record;
-                    kept += usize::from(bounds.hold(Lanes::from_slice(simd, &features[record as usize].0), false));
-                }
-            } else {
-                for &record in records {
-                    rows[kept] = record;
-                    kept += usize::from(bounds.hold(Lanes::from_slice(simd, &features[record as usize].0), true));
-                }
-            }
-            return kept;
-        }
-        for &record in records {
-            let mut all = true;
-            for (interval, features) in self.lines.iter().zip(&features[record as usize * lines..]) {
-                all &= Bounds::of(simd, interval).hold(Lanes::from_slice(simd, &features.0), true);
-            }
-            rows[kept] = record;
-            kept += usize::from(all);
+            kept = match interval.missing {
+                0 => bounds.keep(simd, block, line, &mut records[..kept], false),
+                _ => bounds.keep(simd, block, line, &mut records[..kept], true),
+            };
         }
         kept
     }
@@ -152,6 +127,21 @@ impl<S: Simd> Bounds<S> {
         let Interval { low, high, missing } = interval;
         let (low, high) = (Lanes::from_slice(simd, &low.0), Lanes::from_slice(simd, &high.0));
         Self { low, high, missing: Mask::from_bitmask(simd, *missing) }
+    }
+
+    /// Moves those of some records forward, in order, of which a line of features is inside; says how many they are.
+    #[inline(always)]
+    fn keep(&self, simd: S, block: &Block, line: usize, records: &mut [u32], may_miss: bool) -> usize {
+        let (features, lines) = (block.features(), block.feature_lines());
+        let mut kept = 0;
+        // No branch on what is inside: it could not be foretold.
+        for index in 0..records.len() {
+            let record = records[index];
+            records[kept] = record;
+            let values = Lanes::from_slice(simd, &features[record as usize * lines + line].0);
+            kept += usize::from(self.hold(values, may_miss));
+        }
+        kept
     }
 
     /// Whether 16 features are inside, or, if any `may_miss`, missing where they may be.

@@ -4,7 +4,7 @@ use super::bilateral::{self, Distances};
 use super::block::{Block, ColumnOrder};
 use super::cluster::Cluster;
 use super::information::{Histograms, whole_words};
-use super::neighborhood::{Around, Center, Draws, Offsets};
+use super::neighborhood::{Around, Center, Offsets, draw, room_for};
 use super::params::Params;
 use super::relevance::Relevant;
 use super::statistics::{Scale, Span, center, impute, make_safe, multiply};
@@ -47,9 +47,10 @@ pub(crate) struct Scratch {
     /// The samples around the pixels that are worked on.
     pub(super) block: Block,
     cluster: Cluster,
-    draws: Draws,
     /// The neighbourhood: the first `count` are records of the block, the rest fills up whole lanes.
     rows: Vec<u32>,
+    /// Draws that take more than one try.
+    unfinished: Vec<u32>,
     pub(super) count: usize,
     order: ColumnOrder,
     /// Columns of the neighbourhood, `stride` values apart: whole words of bit masks.
@@ -80,8 +81,8 @@ impl Scratch {
         Self {
             block: Block::with_capacity(room.pixels, room.samples, tile, &order),
             cluster: Cluster::new(features, params),
-            draws: Draws::with_capacity(room.rows),
-            rows: vec![0; stride],
+            rows: vec![0; room_for(stride)],
+            unfinished: Vec::with_capacity(room.rows),
             count: 0,
             columns: vec![0.0; columns * stride],
             radiance: vec![0.0; 3 * stride],
@@ -102,7 +103,7 @@ impl Scratch {
     /// Bytes that [`Scratch::new`] allocates.
     pub(crate) fn bytes(order: &ColumnOrder, room: &Room, varying: bool, bins: u32) -> u64 {
         let (stride, columns, features) = (whole_words(room.rows), order.columns(), order.features.len());
-        let values = stride * size_of::<u32>() + (columns + 3) * stride * size_of::<f32>();
+        let values = (room_for(stride) + room.rows) * size_of::<u32>() + (columns + 3) * stride * size_of::<f32>();
         let small = columns * size_of::<Scale>()
             + features * (6 * size_of::<f64>() + size_of::<f32>())
             + (features + 3) * (size_of::<usize>() + size_of::<f32>());
@@ -110,7 +111,6 @@ impl Scratch {
             + Histograms::bytes(columns, stride, bins)
             + Block::bytes(room.pixels, room.samples, varying, order)
             + Cluster::bytes(features)
-            + Draws::bytes(room.rows)
     }
 
     /// The neighbourhood, as records of the block.
@@ -211,7 +211,7 @@ impl Pass<'_> {
     /// Draws the neighbourhood of a pixel; false if it has no samples.
     #[inline(always)]
     pub(super) fn gather<S: Simd>(&self, simd: S, scratch: &mut Scratch, x: u32, y: u32) -> bool {
-        let Scratch { block, cluster, draws, rows, count, .. } = scratch;
+        let Scratch { block, cluster, rows, unfinished, count, .. } = scratch;
         let own = block.samples_of(x, y);
         if own.is_empty() {
             return false;
@@ -219,12 +219,14 @@ impl Pass<'_> {
         let key = random::pixel_key(self.execution.seed, x, y, self.t);
         let center = Center { x, y, key, wanted: self.params.neighbors(self.t, own.len()) };
         cluster.set(simd, block, own.clone());
-        for (row, sample) in rows.iter_mut().zip(own.clone()) {
+        let (first, drawn) = rows.split_at_mut(own.len());
+        for (row, sample) in first.iter_mut().zip(own) {
             *row = sample as u32;
         }
         let image = self.tile.geometry().image();
         let around = Around { image: &image, block, offsets: &self.offsets, center: &center };
-        *count = cluster.keep(simd, block, draws.make(simd, &around, own.len()), rows, own.len());
+        let candidates = draw(simd, &around, center.wanted.saturating_sub(first.len()), drawn, unfinished);
+        *count = first.len() + cluster.keep(simd, block, &mut drawn[..candidates]);
         let first = rows[0];
         rows[*count..padded(*count)].fill(first);
         true

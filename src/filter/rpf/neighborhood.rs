@@ -109,78 +109,67 @@ pub(crate) struct Center {
     pub(crate) wanted: usize,
 }
 
-/// The draws around one pixel.
-#[derive(Debug)]
-pub(crate) struct Draws {
-    /// The records they end at, or [`NOWHERE`]; whole batches.
-    records: Vec<u32>,
-    /// Those that have not ended yet.
-    unfinished: Vec<u32>,
-}
-
 /// In place of the record of a draw that is dropped.
 const NOWHERE: u32 = u32::MAX;
 
-impl Draws {
-    /// Room for so many rows.
-    pub(crate) fn with_capacity(rows: usize) -> Self {
-        Self { records: vec![0; rows.next_multiple_of(FIRST)], unfinished: Vec::with_capacity(rows) }
-    }
+/// Rows that a buffer for so many must have: a multiple of draws is made at once.
+pub(crate) const fn room_for(rows: usize) -> usize {
+    rows + FIRST - 1
+}
 
-    /// Bytes that [`Draws::with_capacity`] allocates.
-    pub(crate) const fn bytes(rows: usize) -> u64 {
-        ((rows.next_multiple_of(FIRST) + rows) * size_of::<u32>()) as u64
+/// Makes the draws around a pixel that are wanted beside its own samples; `rows` then begins with the records that they
+/// end at, in order, and they are so many. It has [room](room_for) for them; the draws that take more than one try are
+/// kept in `unfinished` meanwhile.
+#[inline(always)]
+pub(crate) fn draw<S: Simd>(
+    simd: S,
+    around: &Around,
+    count: usize,
+    rows: &mut [u32],
+    unfinished: &mut Vec<u32>,
+) -> usize {
+    unfinished.clear();
+    let mut dropped = false;
+    for (first, batch) in (0..count).step_by(FIRST).zip(rows.as_chunks_mut::<FIRST>().0) {
+        // All of them, wanted or not: a fixed number of them the compiler puts into lanes.
+        let tries = around.attempt::<S, FIRST>(simd, |index| (first + index) as u64 * TRIES);
+        *batch = tries.records;
+        let wanted = u64::MAX >> (u64::BITS as usize - FIRST.min(count - first));
+        dropped |= tries.dropped & wanted != 0;
+        let mut failed = tries.failed & wanted;
+        while failed != 0 {
+            unfinished.push(first as u32 + failed.trailing_zeros());
+            failed &= failed - 1;
+        }
     }
-
-    /// Makes the draws around a pixel that has so many samples, and gives the records that they end at, in order.
-    #[inline(always)]
-    pub(crate) fn make<S: Simd>(&mut self, simd: S, around: &Around, own: usize) -> &[u32] {
-        let Self { records, unfinished } = self;
-        let count = around.center.wanted.saturating_sub(own);
-        unfinished.clear();
-        let mut dropped = false;
-        for (first, batch) in (0..count).step_by(FIRST).zip(records.as_chunks_mut::<FIRST>().0) {
-            // All of them, wanted or not: a fixed number of them the compiler puts into lanes.
-            let tries = around.attempt::<S, FIRST>(simd, |index| (first + index) as u64 * TRIES);
-            *batch = tries.records;
-            let wanted = u64::MAX >> (u64::BITS as usize - FIRST.min(count - first));
-            dropped |= tries.dropped & wanted != 0;
-            let mut failed = tries.failed & wanted;
-            while failed != 0 {
-                unfinished.push(first as u32 + failed.trailing_zeros());
-                failed &= failed - 1;
+    for attempt in 1..TRIES {
+        let mut left = 0;
+        for start in (0..unfinished.len()).step_by(AGAIN) {
+            let mut batch = [0; AGAIN];
+            let number = AGAIN.min(unfinished.len() - start);
+            batch[..number].copy_from_slice(&unfinished[start..start + number]);
+            let tries = around.attempt::<S, AGAIN>(simd, |index| u64::from(batch[index]) * TRIES + attempt);
+            dropped |= tries.dropped != 0;
+            for (index, &draw) in batch[..number].iter().enumerate() {
+                rows[draw as usize] = tries.records[index];
+                unfinished[left] = draw;
+                left += usize::from(tries.failed >> index & 1 != 0);
             }
         }
-        for attempt in 1..TRIES {
-            let mut left = 0;
-            for start in (0..unfinished.len()).step_by(AGAIN) {
-                let mut batch = [0; AGAIN];
-                let number = AGAIN.min(unfinished.len() - start);
-                batch[..number].copy_from_slice(&unfinished[start..start + number]);
-                let tries = around.attempt::<S, AGAIN>(simd, |index| u64::from(batch[index]) * TRIES + attempt);
-                dropped |= tries.dropped != 0;
-                for (index, &draw) in batch[..number].iter().enumerate() {
-                    records[draw as usize] = tries.records[index];
-                    unfinished[left] = draw;
-                    left += usize::from(tries.failed >> index & 1 != 0);
-                }
-            }
-            unfinished.truncate(left);
-        }
-        dropped |= !unfinished.is_empty();
-        if !dropped {
-            return &records[..count];
-        }
-        for &draw in &*unfinished {
-            records[draw as usize] = NOWHERE;
-        }
-        let mut kept = 0;
-        for draw in 0..count {
-            records[kept] = records[draw];
-            kept += usize::from(records[draw] != NOWHERE);
-        }
-        &records[..kept]
+        unfinished.truncate(left);
     }
+    if !dropped && unfinished.is_empty() {
+        return count;
+    }
+    for &draw in &*unfinished {
+        rows[draw as usize] = NOWHERE;
+    }
+    let mut kept = 0;
+    for draw in 0..count {
+        rows[kept] = rows[draw];
+        kept += usize::from(rows[draw] != NOWHERE);
+    }
+    kept
 }
 
 /// What some tries end at.
