@@ -14,7 +14,48 @@ use crate::filter::{Plane, Rect, SampleTile};
 #[repr(align(64))]
 pub(crate) struct Line(pub(crate) [f32; LANES]);
 
-/// Columns of a neighbourhood, by role. Features, and positions and random parameters together, fill whole lines.
+/// Half a cache line of a record.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(align(32))]
+struct HalfLine([f32; HALF]);
+
+/// A part of a record: a value of each of some columns, whole halves of vectors.
+trait Part {
+    const COLUMNS: usize;
+    fn values(&self) -> &[f32];
+    fn values_mut(&mut self) -> &mut [f32];
+}
+
+impl Part for Line {
+    const COLUMNS: usize = LANES;
+
+    #[inline(always)]
+    fn values(&self) -> &[f32] {
+        &self.0
+    }
+
+    #[inline(always)]
+    fn values_mut(&mut self) -> &mut [f32] {
+        &mut self.0
+    }
+}
+
+impl Part for HalfLine {
+    const COLUMNS: usize = HALF;
+
+    #[inline(always)]
+    fn values(&self) -> &[f32] {
+        &self.0
+    }
+
+    #[inline(always)]
+    fn values_mut(&mut self) -> &mut [f32] {
+        &mut self.0
+    }
+}
+
+/// Columns of a neighbourhood, by role. Features fill whole lines, since they are tested line by line; positions and
+/// random parameters together fill whole halves of lines.
 #[derive(Clone, Debug)]
 pub(crate) struct ColumnOrder {
     pub(super) features: std::ops::Range<usize>,
@@ -32,7 +73,7 @@ impl ColumnOrder {
     pub(super) const fn new(features: usize, positions: usize, random: usize) -> Self {
         let first = features.next_multiple_of(LANES);
         let second = first + positions;
-        let colors = (second + random).next_multiple_of(LANES);
+        let colors = (second + random).next_multiple_of(HALF);
         Self {
             features: 0..features,
             positions: first..second,
@@ -46,9 +87,9 @@ impl ColumnOrder {
         self.positions.start / LANES
     }
 
-    /// Lines of the positions and random parameters of one sample.
-    pub(super) const fn other_lines(&self) -> usize {
-        (self.colors.start - self.positions.start) / LANES
+    /// Halves of lines of the positions and random parameters of one sample.
+    pub(super) const fn other_halves(&self) -> usize {
+        (self.colors.start - self.positions.start) / HALF
     }
 
     /// Columns in all, those between included that only fill lines.
@@ -64,11 +105,11 @@ pub(crate) struct Block {
     window: Rect,
     layout: SampleLayout,
     feature_lines: usize,
-    other_lines: usize,
+    other_halves: usize,
     /// Of each sample, its features.
     features: Vec<Line>,
     /// Of each sample, positions and random parameters.
-    others: Vec<Line>,
+    others: Vec<HalfLine>,
     /// Of each sample R, G, B, and a 0.
     colors: Vec<[f32; 4]>,
 }
@@ -76,23 +117,23 @@ pub(crate) struct Block {
 impl Block {
     /// Room for so many pixels with so many samples of a tile.
     pub(crate) fn with_capacity(pixels: usize, samples: usize, tile: &SampleTile, order: &ColumnOrder) -> Self {
-        let (feature_lines, other_lines) = (order.feature_lines(), order.other_lines());
+        let (feature_lines, other_halves) = (order.feature_lines(), order.other_halves());
         Self {
             window: Rect::new(0, 0, 0, 0),
             layout: tile.layout().with_capacity(pixels),
             feature_lines,
-            other_lines,
+            other_halves,
             features: Vec::with_capacity(samples * feature_lines),
-            others: Vec::with_capacity(samples * other_lines),
+            others: Vec::with_capacity(samples * other_halves),
             colors: Vec::with_capacity(samples),
         }
     }
 
     /// Bytes that [`Block::with_capacity`] allocates.
     pub(crate) const fn bytes(pixels: usize, samples: usize, varying: bool, order: &ColumnOrder) -> u64 {
-        let lines = order.feature_lines() + order.other_lines();
+        let lines = order.feature_lines() * size_of::<Line>() + order.other_halves() * size_of::<HalfLine>();
         let starts = if varying { (pixels + 1) * size_of::<u32>() } else { 0 };
-        (samples * (lines * size_of::<Line>() + size_of::<[f32; 4]>()) + starts) as u64
+        (samples * (lines + size_of::<[f32; 4]>()) + starts) as u64
     }
 
     /// The pixels whose samples are here.
@@ -141,8 +182,8 @@ impl Block {
         let total = self.layout.total();
         self.features.resize(total * self.feature_lines, Line::default());
         self.colors.resize(total, [0.0; 4]);
-        let others_wanted = if others { total * self.other_lines } else { 0 };
-        self.others.resize(others_wanted, Line::default());
+        let others_wanted = if others { total * self.other_halves } else { 0 };
+        self.others.resize(others_wanted, HalfLine::default());
         let whole = tile.geometry().window();
         for y in window.y..window.bottom() {
             let at = |x: u32| tile.samples_of(whole.index(x, y));
@@ -159,7 +200,7 @@ impl Block {
             if others {
                 let random = relevant.random().iter().map(|&plane| Source::Plane(plane));
                 let sources = relevant.positions().iter().copied().chain(random);
-                copy_row(simd, tile, sources, samples, self.other_lines, &mut self.others, first);
+                copy_row(simd, tile, sources, samples, self.other_halves, &mut self.others, first);
                 self.centers(relevant, y);
             }
         }
@@ -174,7 +215,7 @@ impl Block {
             for x in self.window.x..self.window.right() {
                 let center = if *source == Source::CenterX { x } else { y } as f32 + 0.5;
                 for sample in self.samples_of(x, y) {
-                    self.others[sample * self.other_lines].0[lane] = center;
+                    self.others[sample * self.other_halves].0[lane] = center;
                 }
             }
         }
@@ -206,33 +247,33 @@ impl Block {
     /// The same of positions and random parameters.
     #[inline(always)]
     pub(crate) fn gather_others<S: Simd>(&self, simd: S, rows: &[u32], columns: &mut [f32], stride: usize) {
-        gather_columns(simd, &self.others, self.other_lines, rows, columns, stride);
+        gather_columns(simd, &self.others, self.other_halves, rows, columns, stride);
     }
 }
 
 /// Copies what `sources` have of a run of samples into records, from the record `first` on.
 #[inline(always)]
-fn copy_row<S: Simd>(
+fn copy_row<S: Simd, P: Part>(
     simd: S,
     tile: &SampleTile,
     sources: impl Iterator<Item = Source>,
     samples: std::ops::Range<usize>,
-    lines: usize,
-    records: &mut [Line],
+    parts: usize,
+    records: &mut [P],
     first: usize,
 ) {
     let mut sources = sources.map(|source| match source {
         Source::Plane(plane) => tile.plane(plane),
         Source::CenterX | Source::CenterY => &Plane::Constant(0.0),
     });
-    for line in 0..lines {
+    for part in 0..parts {
         let mut planes = [&Plane::Constant(0.0); LANES];
-        planes.iter_mut().zip(&mut sources).for_each(|(place, plane)| *place = plane);
+        planes[..P::COLUMNS].iter_mut().zip(&mut sources).for_each(|(place, plane)| *place = plane);
         for start in samples.clone().step_by(HALF) {
             let count = HALF.min(samples.end - start);
-            for part in (0..LANES).step_by(HALF) {
+            for column in (0..P::COLUMNS).step_by(HALF) {
                 let mut values = [[Quarter::splat(simd, 0.0); HALF]; 2];
-                for (k, plane) in planes[part..part + HALF].iter().enumerate() {
+                for (k, plane) in planes[column..column + HALF].iter().enumerate() {
                     let mut few = [0.0; HALF];
                     let run = match plane {
                         Plane::Constant(value) => {
@@ -250,9 +291,9 @@ fn copy_row<S: Simd>(
                 }
                 let [first_half, second_half] = values;
                 let values = [transpose(first_half), transpose(second_half)];
-                let place = records[(first + start - samples.start) * lines + line..].iter_mut().step_by(lines);
+                let place = records[(first + start - samples.start) * parts + part..].iter_mut().step_by(parts);
                 for (record, value) in place.zip(&values.as_flattened()[..count]) {
-                    value.store_slice(&mut record.0[part..part + HALF]);
+                    value.store_slice(&mut record.values_mut()[column..column + HALF]);
                 }
             }
         }
@@ -261,11 +302,18 @@ fn copy_row<S: Simd>(
 
 /// Records as columns, 8 rows by 4 columns at a time.
 #[inline(always)]
-fn gather_columns<S: Simd>(simd: S, records: &[Line], lines: usize, rows: &[u32], columns: &mut [f32], stride: usize) {
+fn gather_columns<S: Simd, P: Part>(
+    simd: S,
+    records: &[P],
+    parts: usize,
+    rows: &[u32],
+    columns: &mut [f32],
+    stride: usize,
+) {
     let (rows, _) = rows.as_chunks::<HALF>();
-    for line in 0..lines {
-        for part in (0..LANES).step_by(HALF) {
-            let first = (line * LANES + part) * stride;
+    for part in 0..parts {
+        for column in (0..P::COLUMNS).step_by(HALF) {
+            let first = (part * P::COLUMNS + column) * stride;
             let mut columns = columns[first..first + HALF * stride].chunks_exact_mut(stride);
             let mut next = || columns.next().map(|column| &mut column.as_chunks_mut::<HALF>().0[..rows.len()]);
             let places = [(); HALF].map(|()| next().unwrap_or_default());
@@ -274,7 +322,7 @@ fn gather_columns<S: Simd>(simd: S, records: &[Line], lines: usize, rows: &[u32]
             for (rows, (((((((a, b), c), d), e), f), g), h)) in rows.iter().zip(places) {
                 let mut values = [[Quarter::splat(simd, 0.0); HALF]; 2];
                 for (i, &row) in rows.iter().enumerate() {
-                    let record = &records[row as usize * lines + line].0[part..part + HALF];
+                    let record = &records[row as usize * parts + part].values()[column..column + HALF];
                     values[0][i] = Quarter::from_slice(simd, &record[..QUARTER]);
                     values[1][i] = Quarter::from_slice(simd, &record[QUARTER..]);
                 }

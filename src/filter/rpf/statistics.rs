@@ -49,7 +49,8 @@ pub(crate) fn impute<S: Simd>(simd: S, column: &mut [f32], n: usize) {
         pad(column, n);
         return;
     }
-    let Some(&first) = column.iter().find(|v| !v.is_nan()) else {
+    let first = if present > 0.0 { column.iter().find(|v| !v.is_nan()) } else { None };
+    let Some(&first) = first else {
         column.fill(0.0);
         return;
     };
