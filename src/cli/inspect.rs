@@ -11,6 +11,7 @@ use crate::{
         method::{Algorithm, PRESETS},
         plan::{forecast, plan},
     },
+    image::description::channels_to_json,
     wire::scan::PlaneSummary,
 };
 use indicatif::HumanBytes;
@@ -114,6 +115,7 @@ fn report(input: &Input, method: &Method, leave_out: bool, threads: usize) -> Re
             "most": summary.max_per_pixel,
             "mean": summary.samples as f64 / tiles().map(|t| t.geometry.core().area()).sum::<u64>() as f64,
         },
+        "channels": channels_to_json(summary.first.channels()),
         "planes": planes,
         "preset": method.preset_name(),
         "left_out": {

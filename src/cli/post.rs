@@ -155,7 +155,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         say!("{report:#}");
     } else {
         let (output, bytes) = (args.output.display(), HumanBytes(bytes));
-        say!("{output}: {tiles} tiles sent ({bytes}), {repeated} of them were there already, {seconds:.1} s");
+        say!("{output}: tiles sent: {tiles} ({bytes}), there already: {repeated}, {seconds:.1} s");
     }
     Ok(())
 }

@@ -14,6 +14,7 @@ fn the_real_render() {
     assert_eq!((&report["compressed"], &report["covered_pixels"]), (&true.into(), &(48 * 48).into()));
     assert_eq!((&report["samples"]["total"], &report["samples"]["per_pixel"]), (&(48 * 48 * 4).into(), &4.into()));
     assert_eq!(report["planes"].as_array().unwrap().len(), 27);
+    assert_eq!(report["channels"][1]["role"], "color");
     assert_eq!(report["faults"], Value::Array(Vec::new()));
     let lens = report["planes"].as_array().unwrap().iter().find(|p| p["name"] == "lens.1").unwrap();
     assert_eq!((&lens["left_out"], &lens["max"]), (&"constant".into(), &0.0.into()));

@@ -1,6 +1,7 @@
 //! curl is a complete client.
 
-use super::{Server, tile};
+use super::{Server, neighbors::wait_complete, tile};
+use crate::cli::{json, rpfd, stderr};
 use rpfd::{filter::Rect, wire::ResultDecoder};
 use std::{path::Path, process::Command};
 
@@ -93,4 +94,36 @@ fn curl_does_it_all() {
     assert_eq!(curl(&[&url("/v1/images/shot")]).unwrap().0, 404);
     assert_eq!(curl(&[&url("/livez")]).unwrap().0, 200);
     assert_eq!(curl(&[&url("/readyz")]).unwrap().0, 200);
+}
+
+/// As in the README: what a file holds is what opens an image of its bare cores.
+#[test]
+fn curl_sends_bare_cores() {
+    let server = Server::start(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let url = |path: &str| format!("http://{}{path}", server.address);
+    let cores = at("cores.tiles");
+    let made = rpfd(["synth", "--size", "48x32", "--spp", "2", "--tile", "16", "-o", &cores]);
+    assert!(made.status.success(), "{}", stderr(&made));
+    let found = json(["inspect", &cores]);
+    let open = serde_json::json!({
+        "id": "shot", "width": found["image"][0], "height": found["image"][1], "halo": "neighbors",
+        "samples": found["samples"]["per_pixel"], "channels": found["channels"],
+    });
+    std::fs::write(at("open.json"), open.to_string()).unwrap();
+    let Some((status, opened)) = curl(&["--json", &format!("@{}", at("open.json")), &url("/v1/images")]) else {
+        return;
+    };
+    assert_eq!(status, 201, "{}", String::from_utf8_lossy(&opened));
+    let data = format!("@{cores}");
+    let (status, lines) = curl(&["--data-binary", &data, &url("/v1/images/shot/tiles")]).unwrap();
+    let lines = String::from_utf8(lines).unwrap();
+    assert_eq!((status, lines.matches(r#""state":"stored""#).count()), (200, 6), "{lines}");
+    wait_complete(&server, "shot");
+    let (image, offline) = (at("image.exr"), at("offline.exr"));
+    assert_eq!(curl(&["-o", &image, &url("/v1/images/shot/result.exr")]).unwrap().0, 200);
+    let filtered = rpfd(["filter", &cores, "-o", &offline]);
+    assert!(filtered.status.success(), "{}", stderr(&filtered));
+    assert!(std::fs::read(&image).unwrap() == std::fs::read(&offline).unwrap());
 }
