@@ -10,15 +10,15 @@ use super::statistics::Span;
 use crate::filter::{ChannelSet, Role, Work};
 
 /// Drawing a candidate.
-const DRAW: u64 = 290;
+const DRAW: u64 = 175;
 /// Testing a candidate against the pixel's own samples in one feature.
 const CLUSTER: u64 = 1;
 /// Copying a row of a column into place and normalising it.
 const LOAD: u64 = 15;
 /// Finding the bin of a row of a column.
-const HISTOGRAM: u64 = 6;
+const HISTOGRAM: u64 = 4;
 /// The information of a pair of columns, for each of the bins but one; of a pair with a constant one, for one bin.
-const PAIR: u64 = 115;
+const PAIR: u64 = 105;
 /// The weight of a pair of samples, and what it adds to the sums.
 const WEIGHT: u64 = 10;
 /// The difference of a pair of samples in one column: the unit.
