@@ -322,7 +322,7 @@ mod tests {
             std::thread::sleep(Duration::from_millis(20));
             Ok::<_, io::Error>(Bytes::from_static(b"x"))
         });
-        let slow = refused(Body::from_stream(trickle), pace);
+        let slow = refused(Body::from_stream(trickle.take(100)), pace);
         assert_eq!(slow.code, "body_timeout");
         assert!(slow.detail.contains("bytes came in") && slow.detail.contains("100000 a second"), "{}", slow.detail);
         let silent = refused(Body::from_stream(futures_util::stream::pending::<Result<Bytes, io::Error>>()), pace);

@@ -116,6 +116,17 @@ fn results_that_nobody_reads_have_a_limit() {
 }
 
 #[test]
+fn room_that_ones_own_tiles_hold_is_waited_for() {
+    // Room for one result; two tiles, each of which is at work for longer than anybody may wait.
+    let arguments = ["--unread-results", "1MiB", "--queue-deadline", "200ms", "--work-deadline", "1s"];
+    let server = start(&arguments);
+    let tiles = [0, 200].map(|x| tile([400, 200], Rect::new(x, 0, 200, 200), 0)).concat();
+    let slow = "/v1/filter?preset=paper&boxes=55,55,55,55&fractions=4,4,4,4";
+    let messages = server.post(slow, &tiles).messages();
+    assert_eq!(codes(&messages), ["work_timeout", "work_timeout"]);
+}
+
+#[test]
 fn failures_that_nobody_reads_have_a_limit() {
     let server = start(&["--memory", "1MiB"]);
     // Each is refused, with more words than it has bytes.
