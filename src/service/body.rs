@@ -209,7 +209,7 @@ mod tests {
     use crate::{
         admission::Budget,
         service::{charge::REQUEST, inflate::OVERHEAD},
-        wire::file::MAX_WINDOW_LOG,
+        wire::{Problem, file::MAX_WINDOW_LOG},
     };
 
     const PACE: Pace = Pace { idle: Duration::from_secs(5), rate: 1 };
@@ -224,6 +224,15 @@ mod tests {
             let frames = Frames::new(&headers, body, charge, pace);
             let code = |refusal: Refusal| refusal.0.code;
             frames.map_err(code)?.all(100_000).await.map_err(code)
+        })
+    }
+
+    /// Why a body is refused.
+    fn refused(body: Body, pace: Pace) -> Box<Problem> {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
+        runtime.block_on(async {
+            let charge = Charge::new(&Budget::new(1 << 20, 1), REQUEST, PACE.idle).await.unwrap();
+            Frames::new(&HeaderMap::new(), body, charge, pace).unwrap().all(100_000).await.unwrap_err().0
         })
     }
 
@@ -307,12 +316,16 @@ mod tests {
 
     #[test]
     fn a_trickle_is_given_up() {
-        // Something comes often enough, but 50 seconds of it would not be 10 kB.
+        // Something is there whenever it is asked for, after a while, but 50 seconds of it would not be 10 kB.
         let pace = Pace { idle: Duration::from_millis(100), rate: 100_000 };
-        let trickle = futures_util::stream::unfold((), async |()| {
-            tokio::time::sleep(Duration::from_millis(20)).await;
-            Some((Ok::<_, io::Error>(Bytes::from_static(b"x")), ()))
+        let trickle = futures_util::stream::repeat_with(|| {
+            std::thread::sleep(Duration::from_millis(20));
+            Ok::<_, io::Error>(Bytes::from_static(b"x"))
         });
-        assert_eq!(read(None, Body::from_stream(trickle), 1 << 20, pace).unwrap_err(), "body_timeout");
+        let slow = refused(Body::from_stream(trickle.take(100)), pace);
+        assert_eq!(slow.code, "body_timeout");
+        assert!(slow.detail.contains("bytes came in") && slow.detail.contains("100000 a second"), "{}", slow.detail);
+        let silent = refused(Body::from_stream(futures_util::stream::pending::<Result<Bytes, io::Error>>()), pace);
+        assert_eq!((&*silent.code, &*silent.detail), ("body_timeout", "nothing came for 0.1 seconds"));
     }
 }

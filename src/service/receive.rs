@@ -192,7 +192,8 @@ async fn announce(call: &Call, header: Header) -> Result<Open, Fault> {
         fits(call, &header, header.max_per_pixel()).map_err(tile)?;
     }
     let deadline = service.config.queue_deadline;
-    let unread = service.unread.reserve(call.result_bytes(geometry.core()), deadline).await;
+    // The results of this request's own tiles, which are being made, are nobody's to read yet.
+    let unread = service.unread.reserve_after(call.result_bytes(geometry.core()), call.idle(), deadline).await;
     // Whoever does not read what there is gets no more.
     let unread = unread.map_err(|error| {
         let why = format!("there is no room for this result on the service's disk: {error}");

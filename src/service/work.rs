@@ -117,14 +117,14 @@ impl Drop for Stop {
 mod tests {
     use super::*;
 
-    const LATER: Duration = Duration::from_secs(60);
+    const LATER: Duration = Duration::from_secs(600);
 
     fn runtime() -> tokio::runtime::Runtime {
         tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap()
     }
 
     /// Works until it is told to stop.
-    fn endless<T>(_: &ThreadPool, stop: &AtomicBool) -> Result<T, Refusal> {
+    fn endless<T>(stop: &AtomicBool) -> Result<T, Refusal> {
         while !stop.load(Ordering::Relaxed) {
             std::thread::yield_now();
         }
@@ -150,7 +150,7 @@ mod tests {
         let work = Work::new(1, LATER).unwrap();
         runtime().block_on(async {
             for _ in 0..5 {
-                assert!(timeout(Duration::from_millis(1), work.run(endless::<()>)).await.is_err());
+                assert!(timeout(Duration::from_millis(1), work.run(|_, stop| endless::<()>(stop))).await.is_err());
             }
             assert_eq!(work.run(|_, _| Ok(7)).await.unwrap(), 7);
         });
@@ -160,9 +160,34 @@ mod tests {
     fn a_job_that_takes_too_long_is_stopped() {
         let work = Work::new(1, Duration::from_millis(5)).unwrap();
         runtime().block_on(async {
-            assert_eq!(work.run(endless::<()>).await.unwrap_err().0.code, "work_timeout");
+            assert_eq!(work.run(|_, stop| endless::<()>(stop)).await.unwrap_err().0.code, "work_timeout");
             // One that is done in spite of it is done.
-            assert_eq!(work.run(|pool, stop| endless(pool, stop).or(Ok(7))).await.unwrap(), 7);
+            assert_eq!(work.run(|_, stop| endless(stop).or(Ok(7))).await.unwrap(), 7);
+        });
+    }
+
+    #[test]
+    fn pictures_take_turns_of_their_own() {
+        let work = Work::new(1, LATER).unwrap();
+        runtime().block_on(async {
+            let (begin, begun) = tokio::sync::oneshot::channel();
+            let mut first = Box::pin(work.picture(|stop| {
+                begin.send(()).unwrap();
+                endless::<()>(stop)
+            }));
+            tokio::select! {
+                _ = &mut first => panic!("it ends when it is told to"),
+                begun = begun => begun.unwrap(),
+            }
+            // There is one thread, and so one at a time; tiles do not wait for it.
+            let mut second = Box::pin(work.picture(|_| Ok(7)));
+            assert!(timeout(Duration::from_millis(100), &mut second).await.is_err());
+            assert_eq!(work.run(|_, _| Ok(5)).await.unwrap(), 5);
+            drop(first);
+            assert_eq!(second.await.unwrap(), 7);
+            let panicked: Result<(), Refusal> = work.picture(|_| panic!("on purpose")).await;
+            assert_eq!(panicked.unwrap_err().0.code, "internal");
+            assert_eq!(work.picture(|_| Ok(9)).await.unwrap(), 9);
         });
     }
 }

@@ -9,13 +9,13 @@ use rpfd::filter::{Method, Rect, geometry::tiling};
 use std::{
     collections::HashSet,
     io::{BufRead, BufReader, Write},
+    net::TcpStream,
     sync::Mutex,
     time::Duration,
 };
 
 /// Sends tiles over a connection of their own, and notes what was acknowledged, until an end or a kill.
-fn send(address: &str, body: &[u8], acknowledged: &Mutex<HashSet<Rect>>) -> Option<()> {
-    let mut stream = std::net::TcpStream::connect(address).ok()?;
+fn send(mut stream: TcpStream, body: &[u8], acknowledged: &Mutex<HashSet<Rect>>) -> Option<()> {
     let mut writer = stream.try_clone().ok()?;
     let head = head("POST", "/v1/images/a/tiles", &[], body.len());
     std::thread::scope(|scope| {
@@ -73,13 +73,14 @@ fn round(seed: u64, side: u32, opening: &[u8], tiles: &[(Rect, Vec<u8>)], expect
         let halves = part.split_at(part.len() / 2);
         // It lives longer and longer, so that some time even the slowest machine comes to an end.
         let pause = Duration::from_micros(200 + random.below(250_000 + 50_000 * u64::from(kills)));
-        let address = server.address.clone();
         let folder = std::thread::scope(|scope| {
             for half in [halves.0, halves.1] {
-                let (address, acknowledged) = (&address, &acknowledged);
+                let acknowledged = &acknowledged;
                 let body: Vec<u8> = half.iter().flat_map(|&i| tiles[i].1.clone()).collect();
                 if !body.is_empty() {
-                    scope.spawn(move || send(address, &body, acknowledged));
+                    // From here: once it is killed its port may be somebody else's.
+                    let stream = server.connect();
+                    scope.spawn(move || send(stream, &body, acknowledged));
                 }
             }
             std::thread::sleep(pause);

@@ -1,11 +1,12 @@
 //! Configuration files.
 
-use super::{fuzz, text::make};
+use super::{alone, fuzz, text::make};
 use rpfd::config::{Config, load::load};
 use std::path::Path;
 
 #[test]
 fn configurations() {
+    let alone = alone();
     let printed = load([], [], None).unwrap().to_toml();
     let mut examples: Vec<&str> = printed.split_inclusive('\n').filter(|line| !line.starts_with('#')).collect();
     examples.push(&printed);
@@ -16,6 +17,7 @@ fn configurations() {
     let file = tempfile::NamedTempFile::new().unwrap();
     let read = |path: &Path| load([], [], Some(path));
     let reached = fuzz(
+        &alone,
         "config",
         10,
         |random| make(random, &examples, &words),

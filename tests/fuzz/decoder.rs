@@ -1,6 +1,6 @@
 //! Tile streams.
 
-use super::{ALLOCATIONS, fuzz, mutate::Random, mutate::mutate, vectors};
+use super::{ALLOCATIONS, alone, fuzz, mutate::Random, mutate::mutate, vectors};
 use rpfd::{
     filter::{Channel, ChannelSet, Method, Rect, Role, SampleTile, TileGeometry, plan::plan},
     wire::{Assembler, Decoder, Event, Format, Header, SampleCounts, encode_header, encode_tile},
@@ -186,6 +186,7 @@ fn written(header: &Header, tile: &SampleTile) -> Option<(Vec<u8>, SampleTile)> 
 
 #[test]
 fn tile_streams() {
+    let alone = alone();
     let examples = vectors();
     let make = |random: &mut Random| {
         let mut bytes = if random.one_in(3) { random.pick(&examples).clone() } else { tile(random) };
@@ -197,7 +198,7 @@ fn tile_streams() {
         }
         bytes
     };
-    let reached = fuzz("decoder", 1, make, |bytes, random| {
+    let reached = fuzz(&alone, "decoder", 1, make, |bytes, random| {
         let (reached, whole) = read(bytes, usize::MAX, false);
         // Now and then: the same in pieces, and what comes of writing it again.
         if random.one_in(4) {

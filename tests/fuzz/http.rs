@@ -4,20 +4,26 @@ use std::{
     io::{BufRead, BufReader, Read, Write},
     net::{SocketAddr, TcpStream},
     path::Path,
-    sync::OnceLock,
+    thread::JoinHandle,
     time::Duration,
 };
 
-use super::{decoder, fuzz, mutate::Random, mutate::mutate};
+use super::{alone, decoder, fuzz, mutate::Random, mutate::mutate};
 use rpfd::{
     config::{ByteSize, Config},
     service::Service,
 };
+use tokio::sync::oneshot;
 
-/// The service; it lasts as long as the process.
-fn service() -> SocketAddr {
-    static ADDRESS: OnceLock<SocketAddr> = OnceLock::new();
-    *ADDRESS.get_or_init(|| {
+/// A service in this process; once it is dropped nothing of it is at work any more.
+struct Local {
+    address: SocketAddr,
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Local {
+    fn start() -> Self {
         // Without the images of the run before.
         let data_dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fuzz-http");
         let _ = std::fs::remove_dir_all(&data_dir);
@@ -35,12 +41,21 @@ fn service() -> SocketAddr {
         };
         let service = Service::bind(config).unwrap();
         let address = service.local_addr();
-        std::thread::spawn(move || {
+        let (stop, stopped) = oneshot::channel();
+        let thread = std::thread::spawn(move || {
             let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
-            runtime.block_on(service.run(std::future::pending())).unwrap();
+            runtime.block_on(service.run(async { drop(stopped.await) })).unwrap();
         });
-        address
-    })
+        Self { address, stop: Some(stop), thread: Some(thread) }
+    }
+}
+
+impl Drop for Local {
+    fn drop(&mut self) {
+        drop(self.stop.take());
+        let ended = self.thread.take().map(JoinHandle::join);
+        assert!(std::thread::panicking() || ended.is_some_and(|ended| ended.is_ok()));
+    }
 }
 
 /// Lines that are a request: method and target, headers, and what the body is.
@@ -127,7 +142,7 @@ fn body(line: &[u8], random: &mut Random) -> Vec<u8> {
 }
 
 /// Sends a request and reads the head and the body of the answer; none if what was sent is no HTTP.
-fn ask(request: &[u8], random: &mut Random) -> Option<(u16, String, Vec<u8>)> {
+fn ask(service: SocketAddr, request: &[u8], random: &mut Random) -> Option<(u16, String, Vec<u8>)> {
     // Whatever else they are, lines stay lines.
     let clean =
         |line: &[u8]| line.iter().copied().filter(|b| (b' '..0x7f).contains(b) || *b >= 0x80).collect::<Vec<_>>();
@@ -141,8 +156,8 @@ fn ask(request: &[u8], random: &mut Random) -> Option<(u16, String, Vec<u8>)> {
     }
     bytes.extend(format!("Content-Length: {}\r\n\r\n", body.len()).into_bytes());
     bytes.extend(body);
-    let mut stream = TcpStream::connect(service()).unwrap();
-    stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+    let mut stream = TcpStream::connect(service).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(600))).unwrap();
     let _ = stream.write_all(&bytes);
     let mut reader = BufReader::new(stream);
     let mut head = String::new();
@@ -156,10 +171,13 @@ fn ask(request: &[u8], random: &mut Random) -> Option<(u16, String, Vec<u8>)> {
 
 #[test]
 fn requests() {
-    let reached = fuzz("http", 20, make, |request, random| {
-        let Some((status, head, body)) = ask(request, random) else {
-            // The service is there all the same.
-            assert_eq!(ask(b"GET /livez\n\n", random).unwrap().0, 200);
+    let alone = alone();
+    let service = Local::start();
+    let reached = fuzz(&alone, "http", 20, make, |request, random| {
+        let Some((status, head, body)) = ask(service.address, request, random) else {
+            // The service is there all the same; a client that stalls it may have taken for one that says nothing.
+            let answer = (0..20).find_map(|_| ask(service.address, b"GET /livez\n\n", random));
+            assert_eq!(answer.unwrap().0, 200);
             return "no answer";
         };
         if status < 400 {

@@ -1,6 +1,6 @@
 //! Images as they are found on the disk: records of any bytes in a store that is whole, and stores that are damaged.
 
-use super::{ALLOCATIONS, fuzz, mutate::Random, mutate::mutate};
+use super::{ALLOCATIONS, alone, fuzz, mutate::Random, mutate::mutate};
 use rpfd::{
     disk::{Folder, Storage},
     filter::{
@@ -409,6 +409,7 @@ const WORDS: &[&[u8]] = &[
 
 #[test]
 fn records() {
+    let alone = alone();
     count_panics();
     let examples: Vec<Script> = examples().iter().map(script).collect();
     let others: Vec<Vec<u8>> = examples.iter().flatten().map(|(_, bytes)| bytes.clone()).collect();
@@ -434,7 +435,7 @@ fn records() {
         }
         encode(&script)
     };
-    let reached = fuzz("records", 20, make, |bytes, _| {
+    let reached = fuzz(&alone, "records", 20, make, |bytes, _| {
         let (reached, panics) = watched(&folder(&decode(bytes)), bytes.len(), 0);
         // Not one that the store has caught either: its file is whole.
         assert_eq!(panics, 0, "{}", last_panic());
@@ -446,6 +447,7 @@ fn records() {
 /// An input is an example, and changes of its store: what, where, and with which bytes.
 #[test]
 fn stores() {
+    let alone = alone();
     count_panics();
     let examples = examples();
     let files: Vec<(Vec<u8>, Vec<usize>)> = examples
@@ -470,7 +472,7 @@ fn stores() {
         });
         [example].into_iter().chain(bytes).collect()
     };
-    let reached = fuzz("state", 40, make, |bytes, _| {
+    let reached = fuzz(&alone, "state", 40, make, |bytes, _| {
         let Some((&example, changes)) = bytes.split_first() else { return "no input" };
         let example = usize::from(example) % examples.len();
         let (mut state, blocks) = files[example].clone();

@@ -20,7 +20,7 @@ use std::{
     collections::BTreeMap,
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
-    sync::{Mutex, PoisonError},
+    sync::{Mutex, MutexGuard, PoisonError},
     time::Instant,
 };
 
@@ -30,8 +30,12 @@ use peak_alloc::PeakAlloc;
 #[global_allocator]
 static ALLOCATIONS: PeakAlloc = PeakAlloc;
 
-/// One target at a time: what others allocate would count.
+/// One target at a time, with all that it prepares: what others allocate would count.
 static ALONE: Mutex<()> = Mutex::new(());
+
+fn alone() -> MutexGuard<'static, ()> {
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 fn variable(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |value| value.parse().expect(name))
@@ -59,15 +63,15 @@ fn vectors() -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// Runs a target: all files first, then as many times as were asked for, over `share`, with what `make` makes. How far
+/// Runs a target of a test that is [`alone`]: all files first, then as many times as were asked for, over `share`, with what `make` makes. How far
 /// the inputs came is counted, printed, and returned.
 fn fuzz(
+    _alone: &MutexGuard<'static, ()>,
     name: &str,
     share: u64,
     mut make: impl FnMut(&mut Random) -> Vec<u8>,
     mut target: impl FnMut(&[u8], &mut Random) -> &'static str,
 ) -> BTreeMap<&'static str, u64> {
-    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let (seed, executions) = (variable("RPFD_FUZZ_SEED", 1), variable("RPFD_FUZZ", 20_000) / share);
     let mut random = Random::new(seed);
     let mut reached = BTreeMap::new();

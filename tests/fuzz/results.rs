@@ -1,6 +1,6 @@
 //! Result streams, as a client reads them.
 
-use super::{fuzz, mutate::Random, mutate::mutate, vectors};
+use super::{alone, fuzz, mutate::Random, mutate::mutate, vectors};
 use rpfd::wire::ResultDecoder;
 
 /// The messages in words, and the error.
@@ -27,6 +27,7 @@ fn read(bytes: &[u8], piece: usize) -> (usize, String) {
 
 #[test]
 fn result_streams() {
+    let alone = alone();
     let examples = vectors();
     let results: Vec<_> = super::files("proto/vectors", "result").into_iter().map(|file| file.1).collect();
     let words: &[&[u8]] =
@@ -36,7 +37,7 @@ fn result_streams() {
         mutate(&mut bytes, random, &examples, words);
         bytes
     };
-    let reached = fuzz("results", 10, make, |bytes, random| {
+    let reached = fuzz(&alone, "results", 10, make, |bytes, random| {
         let whole = read(bytes, usize::MAX);
         assert_eq!(read(bytes, 1 + random.below(20)), whole);
         ["no message", "a message", "several messages"][whole.0.min(2)]

@@ -1,6 +1,6 @@
 //! Files of tiles, and the samples that are kept of them.
 
-use super::{decoder, fuzz, mutate::Random, mutate::mutate, vectors};
+use super::{alone, decoder, fuzz, mutate::Random, mutate::mutate, vectors};
 use rpfd::{
     filter::{Rect, TileGeometry},
     store::Spool,
@@ -9,6 +9,7 @@ use rpfd::{
 
 #[test]
 fn files_and_spools() {
+    let alone = alone();
     let examples = vectors();
     let make = |random: &mut Random| {
         let mut bytes = if random.one_in(2) { random.pick(&examples).clone() } else { decoder::tile(random) };
@@ -26,7 +27,7 @@ fn files_and_spools() {
         }
         bytes
     };
-    let reached = fuzz("store", 20, make, |bytes, random| {
+    let reached = fuzz(&alone, "store", 20, make, |bytes, random| {
         let open = || TileFile::from_reader("input", std::io::Cursor::new(bytes.to_vec())).unwrap();
         let scanned = scan_file(&mut open());
         let (mut file, mut spool) = (open(), Spool::in_memory(1 << 16));

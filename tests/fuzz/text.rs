@@ -1,6 +1,6 @@
 //! What people write: sizes and parameters.
 
-use super::{fuzz, mutate::Random, mutate::mutate};
+use super::{alone, fuzz, mutate::Random, mutate::mutate};
 use rpfd::{
     config::ByteSize,
     filter::{Method, method::PRESETS},
@@ -17,10 +17,12 @@ pub(super) fn make(random: &mut Random, examples: &[&str], words: &[&str]) -> Ve
 
 #[test]
 fn sizes() {
+    let alone = alone();
     let examples =
         ["0", "1048576", "512MiB", "2 GiB", "1.5GiB", "0.1KiB", "64kB", "16777215TiB", "18446744073709551615B"];
     let words = [".", "9", "TiB", "e", "-", " ", "99999999999999999999"];
     let reached = fuzz(
+        &alone,
         "size",
         10,
         |random| make(random, &examples, &words),
@@ -44,6 +46,7 @@ fn sizes() {
 
 #[test]
 fn parameters() {
+    let alone = alone();
     let mut examples: Vec<String> = Vec::new();
     for (preset, _) in PRESETS {
         let parameters = Method::preset(preset).unwrap().parameters();
@@ -54,6 +57,7 @@ fn parameters() {
     let examples: Vec<&str> = examples.iter().map(String::as_str).collect();
     let words = ["&", "=", ",", "17", "0", "-1", "1e9", "nan", "inf", "on", "off", "4294967297", "0.5", "55"];
     let reached = fuzz(
+        &alone,
         "method",
         10,
         |random| make(random, &examples, &words),

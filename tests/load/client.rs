@@ -3,7 +3,6 @@
 use std::{
     collections::BTreeMap,
     io::{Read, Write},
-    net::TcpStream,
     time::{Duration, Instant},
 };
 
@@ -127,13 +126,6 @@ impl<'a> Client<'a> {
         (path, body, count as u64, pixels)
     }
 
-    fn connect(&self) -> TcpStream {
-        let stream = self.server.connect();
-        stream.set_read_timeout(Some(Duration::from_secs(300))).unwrap();
-        stream.set_write_timeout(Some(Duration::from_secs(300))).unwrap();
-        stream
-    }
-
     fn unexpected(&mut self, what: &str, answer: &Answer) {
         let body = String::from_utf8_lossy(&answer.body[..answer.body.len().min(300)]).into_owned();
         self.tally.unexpected.push(format!("client {}: {what}: {} {body}", self.index, answer.status));
@@ -142,7 +134,7 @@ impl<'a> Client<'a> {
     /// Sends a request until it is not busy; the answer, and how long each part of it took.
     fn ask(&mut self, head: &str, body: &[u8], first: bool) -> Answer {
         loop {
-            let mut stream = self.connect();
+            let mut stream = self.server.connect();
             let mut writer = stream.try_clone().unwrap();
             let started = Instant::now();
             let mut send = || {
@@ -273,7 +265,7 @@ impl<'a> Client<'a> {
     /// Brings a small tile at 200 kB a second.
     fn slow(&mut self) -> &'static str {
         let (side, tile) = &self.tiles.sizes[self.turns % 2];
-        let mut stream = self.connect();
+        let mut stream = self.server.connect();
         let _ = stream.write_all(head("POST", "/v1/filter?preset=gaussian", &[], tile.len()).as_bytes());
         for piece in tile.chunks(4000) {
             std::thread::sleep(Duration::from_millis(20));
@@ -296,17 +288,17 @@ impl<'a> Client<'a> {
     fn vanishing(&mut self) -> &'static str {
         let (path, body, ..) = self.stream(1);
         let end = if self.turns.is_multiple_of(3) { body.len() } else { self.below(body.len() as u64) as usize };
-        let mut stream = self.connect();
+        let mut stream = self.server.connect();
         let _ = stream.write_all(head("POST", &path, &[], body.len()).as_bytes());
         let _ = stream.write_all(&body[..end]);
         pause();
         "vanish"
     }
 
-    /// Sends little that comes to much, and never reads; after a while the service is rid of it.
+    /// Sends little that comes to much, and never reads; after a while it goes.
     fn silent(&mut self) -> &'static str {
         let body: Vec<u8> = (0..40).flat_map(|at| plain(256, 1, at)).collect();
-        let mut stream = self.connect();
+        let mut stream = self.server.connect();
         let _ = stream.write_all(head("POST", "/v1/filter?preset=unfiltered", &[], body.len()).as_bytes());
         let _ = stream.write_all(&body);
         std::thread::sleep(Duration::from_secs(5));

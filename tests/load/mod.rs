@@ -5,7 +5,7 @@
 
 mod client;
 mod large;
-mod process;
+pub(crate) mod process;
 
 use std::{
     sync::{
@@ -47,7 +47,8 @@ impl Tiles {
 
 /// Runs a load of so many tiles against a service of so much memory.
 fn load(tiles: &Tiles, memory: u64, count: usize) {
-    let server = Server::start(&["--memory", &memory.to_string(), "--idle-deadline", "3", "--threads", "2"]);
+    // No good client is cut off, however slow the machine; those that never read go by themselves.
+    let server = Server::start(&["--memory", &memory.to_string(), "--queue-deadline", "60", "--threads", "2"]);
     let process = Process::of(server.pid());
     let (taken, tally) = (AtomicUsize::new(0), Mutex::new(Tally::default()));
     let started = Instant::now();

@@ -2,27 +2,27 @@
 
 use std::path::PathBuf;
 
-pub(super) struct Process(PathBuf);
+pub(crate) struct Process(PathBuf);
 
 impl Process {
-    pub(super) fn of(id: u32) -> Self {
+    pub(crate) fn of(id: u32) -> Self {
         Self(format!("/proc/{id}").into())
     }
 
     /// Most memory that was resident at once, in bytes.
-    pub(super) fn peak_memory(&self) -> u64 {
+    pub(crate) fn peak_memory(&self) -> u64 {
         let status = std::fs::read_to_string(self.0.join("status")).unwrap();
         let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
         line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
     }
 
     /// CPU time of all its threads, also those that have ended.
-    pub(super) fn cpu_seconds(&self) -> f64 {
+    pub(crate) fn cpu_seconds(&self) -> f64 {
         seconds(&std::fs::read_to_string(self.0.join("stat")).unwrap())
     }
 
     /// CPU time of the threads that filter.
-    pub(super) fn filter_seconds(&self) -> f64 {
+    pub(crate) fn filter_seconds(&self) -> f64 {
         let threads = std::fs::read_dir(self.0.join("task")).unwrap();
         let stats = threads.filter_map(|thread| std::fs::read_to_string(thread.unwrap().path().join("stat")).ok());
         stats.filter(|stat| stat.contains("(filter-")).map(|stat| seconds(&stat)).sum()

@@ -1,81 +1,32 @@
 //! Back-pressure: slow, silent and vanishing clients, full queues, results that nobody reads.
 
-use super::{Answer, head, samples, tile};
+use super::{Answer, Server, samples, tile, wait_until, whole};
+use crate::load::process::Process;
 use rpfd::{
-    config::{ByteSize, Config},
     filter::{Channel, ChannelSet, Execution, Method, Rect, Role, TileGeometry, plan::Shape, plan::plan},
-    service::Service,
     synth::Scene,
     wire::{Format, Header, Message, SampleCounts, encode_header},
 };
 use std::{
     io::{Read, Write},
-    net::{SocketAddr, TcpStream},
+    sync::atomic::{AtomicBool, Ordering},
     time::Duration,
 };
 
-/// A service in this process, configured at will.
-struct Local {
-    address: SocketAddr,
-    stop: Option<tokio::sync::oneshot::Sender<()>>,
-    thread: Option<std::thread::JoinHandle<()>>,
-    _folder: tempfile::TempDir,
+const MEMORY_USED: &str = "rpfd_memory_used_bytes";
+const IN_FLIGHT: &str = "rpfd_requests_in_flight";
+/// Tiles that got their memory, that got a thread, and that were filtered.
+const ADMITTED: &str = "rpfd_tile_phase_seconds_count{phase=\"queue\"}";
+const BEGUN: &str = "rpfd_tile_phase_seconds_count{phase=\"turn\"}";
+const FILTERED: &str = "rpfd_tile_phase_seconds_count{phase=\"filter\"}";
+
+/// A service that filters on one thread.
+fn start(arguments: &[&str]) -> Server {
+    Server::start(&[&["--threads", "1", "--metrics-listen", "127.0.0.1:0"], arguments].concat())
 }
 
-impl Local {
-    fn start(change: impl FnOnce(&mut Config)) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let mut config = Config {
-            listen: "127.0.0.1:0".parse().unwrap(),
-            data_dir: folder.path().to_owned(),
-            threads: 1,
-            ..Config::default()
-        };
-        change(&mut config);
-        let service = Service::bind(config).unwrap();
-        let address = service.local_addr();
-        let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
-        let thread = std::thread::spawn(move || {
-            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-            runtime.block_on(service.run(async { drop(stopped.await) })).unwrap();
-        });
-        Self { address, stop: Some(stop), thread: Some(thread), _folder: folder }
-    }
-
-    fn connect(&self) -> TcpStream {
-        let stream = TcpStream::connect(self.address).unwrap();
-        stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
-        stream.set_write_timeout(Some(Duration::from_secs(60))).unwrap();
-        stream
-    }
-
-    /// Sends a request, or as much of its body as is given.
-    fn send(&self, path: &str, body: &[u8], length: usize) -> TcpStream {
-        let mut stream = self.connect();
-        stream.write_all(head("POST", path, &[], length).as_bytes()).unwrap();
-        // The service may close its end early.
-        let _ = stream.write_all(body);
-        stream
-    }
-
-    fn post(&self, path: &str, body: &[u8]) -> Answer {
-        Answer::read(&mut self.send(path, body, body.len()))
-    }
-
-    fn get(&self, path: &str) -> Answer {
-        let mut stream = self.connect();
-        stream.write_all(head("GET", path, &[], 0).as_bytes()).unwrap();
-        Answer::read(&mut stream)
-    }
-}
-
-impl Drop for Local {
-    fn drop(&mut self) {
-        drop(self.stop.take());
-        if let Some(thread) = self.thread.take() {
-            assert!(thread.join().is_ok() || std::thread::panicking());
-        }
-    }
+fn problems(server: &Server, code: &str) -> f64 {
+    server.metric(&format!("rpfd_problems_total{{code=\"{code}\"}}")).unwrap_or_default()
 }
 
 /// A tile of one colour, some hundred bytes, whose result has 12 bytes a pixel.
@@ -96,9 +47,9 @@ fn codes(messages: &[Message]) -> Vec<&str> {
     codes.into_iter().map(|code| &*code.leak()).collect()
 }
 
-/// Memory for a budget of so much for tiles, where a quarter is for requests.
-const fn memory(tiles: u64) -> ByteSize {
-    ByteSize((tiles + 2) * 4 / 3)
+/// Memory for a budget of so much for tiles, where a quarter is for requests, as an argument.
+fn memory(tiles: u64) -> String {
+    ((tiles + 2) * 4 / 3).to_string()
 }
 
 fn needed(header: &Header, method: &Method) -> u64 {
@@ -107,69 +58,91 @@ fn needed(header: &Header, method: &Method) -> u64 {
 
 #[test]
 fn who_vanishes_frees_what_he_held_within_a_row_of_work() {
-    let settings = [("boxes", "55,55,55,55"), ("fractions", "4,4,4,4")];
-    let query = "preset=paper&boxes=55,55,55,55&fractions=4,4,4,4";
-    let (image, rect) = ([1024, 48], Rect::new(0, 0, 1024, 48));
-    let whole = samples(image, rect, 0, 1);
-    let header = Header::of(&whole, Format::F32).unwrap();
-    let body = super::encode(&whole);
-    // Hours of work, a row of which takes several times the deadline of the next in the queue.
-    let server = Local::start(|config| {
-        config.memory = memory(needed(&header, &Method::with("paper", settings).unwrap()));
-        config.queue_deadline = Duration::from_secs(3);
-    });
-    for _ in 0..2 {
-        let gone = server.send(&format!("/v1/filter?{query}"), &body, body.len());
-        // Once it is being filtered nobody else gets in.
-        while server.post("/v1/filter?preset=unfiltered", &body).status == 200 {}
+    // Days of work, a row of which takes minutes.
+    const SIZE: [u32; 2] = [8192, 16];
+    let path = "/v1/filter?preset=paper&boxes=55,55,55,55&fractions=4,4,4,4";
+    let body = tile(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0);
+    let server = start(&[]);
+    let process = Process::of(server.pid());
+    for (begun, accept) in [(1.0, "Accept: application/msgpack"), (2.0, "Accept: image/x-exr")] {
+        let gone = server.send(path, &[accept], &body, body.len());
+        wait_until("it is being filtered", || server.metric(BEGUN) == Some(begun));
+        let before = process.filter_seconds();
         drop(gone);
-        assert_eq!(server.post("/v1/filter?preset=unfiltered", &body).messages().len(), 2);
+        wait_until("what he held is free", || server.metric(MEMORY_USED) == Some(0.0));
+        // Of the filter's own time, whatever else the machine does.
+        let seconds = process.filter_seconds() - before;
+        assert!(seconds < 30.0, "{seconds}");
     }
+    assert_eq!(server.metric(FILTERED), Some(0.0));
+    assert_eq!(server.post("/v1/filter", &whole(16)).messages().len(), 2);
 }
 
 #[test]
 fn who_never_reads_is_cut_off() {
-    let server = Local::start(|config| config.idle_deadline = Duration::from_millis(300));
+    let server = start(&["--idle-deadline", "300ms"]);
     let body: Vec<u8> = (0..60).flat_map(|i| plain(256, 1, i)).collect();
-    let mut stream = server.send("/v1/filter?preset=unfiltered", &body, body.len());
     // Far more than sockets hold waits to be read; nothing is, until the service has given up.
-    while server.get("/v1/images").status != 200 {}
-    std::thread::sleep(Duration::from_secs(4));
+    let mut stream = server.send("/v1/filter?preset=unfiltered", &[], &body, body.len());
+    let answered = "rpfd_requests_total{route=\"/v1/filter\",method=\"POST\",status=\"200\"}";
+    wait_until("it is answered", || server.metric(answered) == Some(1.0));
+    wait_until("it is cut off", || server.metric(IN_FLIGHT) == Some(0.0));
     let mut read = Vec::new();
     let _ = stream.read_to_end(&mut read);
-    assert!(!read.is_empty() && read.len() < 60 * 12 * 256 * 256, "{} bytes", read.len());
+    assert!(read.starts_with(b"HTTP/1.1 200") && read.len() < 60 * 12 * 256 * 256, "{} bytes", read.len());
 }
 
 #[test]
 fn results_that_nobody_reads_have_a_limit() {
-    let server = Local::start(|config| {
-        config.unread_results = ByteSize(1 << 20);
-        config.queue_deadline = Duration::from_millis(300);
-    });
-    let body: Vec<u8> = (0..60).flat_map(|i| plain(256, 1, i)).collect();
-    let mut stream = server.send("/v1/filter?preset=unfiltered", &body, body.len());
-    std::thread::sleep(Duration::from_secs(3));
+    let server = start(&["--unread-results", "1MiB", "--queue-deadline", "300ms"]);
+    let body = |tiles| (0..tiles).flat_map(|i| plain(256, 1, i)).collect::<Vec<u8>>();
+    let sixty = body(60);
+    let mut stream = server.send("/v1/filter?preset=unfiltered", &[], &sixty, sixty.len());
+    wait_until("no more are taken", || problems(&server, "results_unread") == 1.0);
     let messages = Answer::read(&mut stream).messages();
     // Some fit into the sockets; after that one waits, and then it ends in good order.
     assert_eq!(codes(&messages), ["results_unread"]);
     let Some(Message::End { tiles, errors: 1 }) = messages.last() else { panic!("{messages:?}") };
     assert!((1..60).contains(tiles));
-    // What was read is free again, and one who reads as he sends knows no limit.
-    for _ in 0..3 {
-        assert_eq!(server.post("/v1/filter?preset=unfiltered", &body[..body.len() / 4]).status, 200);
-    }
     // A result larger than all of them together.
     let answer = server.post("/v1/filter?preset=unfiltered", &plain(512, 1, 0));
     answer.problem(507, "results_unread");
+    // What was read is free again, and one who reads as he sends knows no limit.
+    let server = start(&["--unread-results", "1MiB"]);
+    for _ in 0..3 {
+        let messages = server.post("/v1/filter?preset=unfiltered", &body(15)).messages();
+        assert_eq!((codes(&messages), messages.len()), (Vec::new(), 16));
+    }
+}
+
+#[test]
+fn room_that_ones_own_tiles_hold_is_waited_for() {
+    // Room for one result; two tiles, each of which is at work for longer than anybody may wait.
+    let arguments = ["--unread-results", "1MiB", "--queue-deadline", "200ms", "--work-deadline", "1s"];
+    let server = start(&arguments);
+    let tiles = [0, 200].map(|x| tile([400, 200], Rect::new(x, 0, 200, 200), 0)).concat();
+    let slow = "/v1/filter?preset=paper&boxes=55,55,55,55&fractions=4,4,4,4";
+    let messages = server.post(slow, &tiles).messages();
+    assert_eq!(codes(&messages), ["work_timeout", "work_timeout"]);
 }
 
 #[test]
 fn failures_that_nobody_reads_have_a_limit() {
-    let server = Local::start(|config| config.memory = ByteSize(1 << 20));
+    let server = start(&["--memory", "1MiB"]);
     // Each is refused, with more words than it has bytes.
-    let mut body = plain(16, 1, 0);
-    (0..150_000).for_each(|i| body.extend(plain(1024, 1000, i % 1024)));
-    let mut stream = server.send("/v1/filter?preset=unfiltered", &body, body.len());
+    let (first, part) = (plain(16, 1, 0), plain(1024, 1000, 1).repeat(1000));
+    let mut stream = server.send("/v1/filter?preset=unfiltered", &[], &first, first.len() + 150 * part.len());
+    let refused = || problems(&server, "results_unread") == 1.0;
+    // It is sent no more than it takes, which it would have to throw away.
+    for parts in 1..=150 {
+        stream.write_all(&part).unwrap();
+        let all = || problems(&server, "over_memory") == f64::from(parts * 1000);
+        wait_until("they are refused", || refused() || all());
+        if refused() {
+            break;
+        }
+    }
+    wait_until("no more are taken", refused);
     let messages = Answer::read(&mut stream).messages();
     let codes = codes(&messages);
     assert_eq!(codes.last(), Some(&"results_unread"));
@@ -178,67 +151,75 @@ fn failures_that_nobody_reads_have_a_limit() {
 
 #[test]
 fn a_trickle_does_not_hold_memory() {
-    let server = Local::start(|config| {
-        config.idle_deadline = Duration::from_millis(300);
-        config.min_rate = ByteSize(100_000);
-    });
+    let server = start(&["--idle-deadline", "300ms", "--min-rate", "100000"]);
     let body = tile([64, 64], Rect::new(0, 0, 64, 64), 0);
-    let mut stream = server.send("/v1/filter", &body[..2000], body.len());
-    let mut writer = stream.try_clone().unwrap();
+    let mut stream = server.send("/v1/filter", &[], &body[..2000], body.len());
+    let (mut writer, answered) = (stream.try_clone().unwrap(), AtomicBool::new(false));
     std::thread::scope(|scope| {
+        // All of it would take hours.
         scope.spawn(|| {
-            for byte in &body[2000..4000] {
+            for byte in &body[2000..] {
                 std::thread::sleep(Duration::from_millis(10));
-                if writer.write_all(&[*byte]).is_err() {
+                if answered.load(Ordering::Relaxed) || writer.write_all(&[*byte]).is_err() {
                     return;
                 }
             }
         });
-        let problem = Answer::read(&mut stream).problem(408, "body_timeout");
-        assert!(problem["detail"].as_str().unwrap().contains("100000 a second"), "{problem}");
+        let there = stream.peek(&mut [0]);
+        answered.store(true, Ordering::Relaxed);
+        there.unwrap();
+        Answer::read(&mut stream).problem(408, "body_timeout");
     });
+    wait_until("its memory is free", || server.metric(MEMORY_USED) == Some(0.0));
 }
 
 #[test]
 fn a_tile_that_takes_too_long_is_given_up_and_the_next_is_not() {
-    let server = Local::start(|config| config.work_deadline = Duration::from_millis(200));
+    let server = start(&["--work-deadline", "200ms"]);
     let body = tile([64, 64], Rect::new(0, 0, 64, 64), 0);
     let slow = "/v1/filter?preset=paper&boxes=55,55,55,55&fractions=4,4,4,4";
     let messages = server.post(slow, &body).messages();
     assert_eq!(codes(&messages), ["work_timeout"]);
     assert_eq!(messages.last(), Some(&Message::End { tiles: 0, errors: 1 }));
-    assert_eq!(codes(&server.post("/v1/filter?preset=unfiltered", &body).messages()), [""; 0]);
+    // On a machine that stalls even this may take too long.
+    wait_until("the next is filtered", || {
+        let messages = server.post("/v1/filter?preset=unfiltered", &body).messages();
+        let codes = codes(&messages);
+        assert!(codes.iter().all(|&code| code == "work_timeout"), "{codes:?}");
+        codes.is_empty()
+    });
 }
 
 #[test]
 fn a_full_queue_refuses_at_once_and_says_when_to_come_again() {
-    let rect = Rect::new(0, 0, 48, 48);
-    let header = Header::of(&samples([48, 48], rect, 0, 1), Format::F32).unwrap();
-    let body = tile([48, 48], rect, 0);
-    let server = Local::start(|config| {
-        config.memory = memory(needed(&header, &Method::default()));
-        config.queue = 1;
-    });
-    // One holds the memory, one waits; the third does not wait for its deadline of a minute.
-    let held = server.send("/v1/filter", &body[..body.len() / 2], body.len());
-    let mut refused = Vec::new();
-    let mut waiting = Vec::new();
-    for _ in 0..4 {
-        waiting.push(server.send("/v1/filter", &body, body.len()));
-    }
-    for stream in &mut waiting {
-        stream.set_read_timeout(Some(Duration::from_secs(2))).unwrap();
-        let mut byte = [0; 1];
-        if stream.peek(&mut byte).is_ok() {
-            refused.push(Answer::read(stream));
+    let rect = Rect::new(0, 0, 128, 128);
+    let header = Header::of(&samples([128, 128], rect, 0, 1), Format::F32).unwrap();
+    let body = tile([128, 128], rect, 0);
+    // A third of that is enough for the five requests.
+    let memory = memory(needed(&header, &Method::default()));
+    let server = start(&["--memory", &memory, "--queue", "1"]);
+    // One holds the memory, one waits; the others do not wait for their deadline.
+    let mut held = server.send("/v1/filter", &[], &body[..body.len() / 2], body.len());
+    wait_until("one has the memory", || server.metric(ADMITTED) == Some(1.0));
+    let waiting = [(); 4].map(|()| server.send("/v1/filter", &[], &body[..2000], body.len()));
+    wait_until("three are refused", || problems(&server, "busy") == 3.0);
+    assert_eq!(server.metric("rpfd_queue_length"), Some(1.0));
+    held.write_all(&body[body.len() / 2..]).unwrap();
+    assert_eq!(Answer::read(&mut held).messages().len(), 2);
+    let mut refused = 0;
+    for mut stream in waiting {
+        // The service may not take the rest of those that it has refused.
+        let _ = stream.write_all(&body[2000..]);
+        let answer = Answer::read(&mut stream);
+        if answer.status == 200 {
+            assert_eq!(answer.messages().len(), 2);
+            continue;
         }
-    }
-    assert_eq!(refused.len(), 3);
-    for answer in &refused {
         answer.problem(503, "busy");
         assert!((1..=600).contains(&answer.header("retry-after").unwrap().parse().unwrap()));
+        refused += 1;
     }
-    drop(held);
+    assert_eq!(refused, 3);
 }
 
 #[test]
@@ -251,9 +232,9 @@ fn a_varying_tile_is_admitted_by_its_counts() {
     // By what its header says one pixel might have all its samples.
     assert!(needed(&header, &Method::default()) > 4 * exact);
     let body = super::encode(&tile);
-    let fits = Local::start(|config| config.memory = memory(exact));
+    let fits = start(&["--memory", &memory(exact)]);
     assert_eq!(codes(&fits.post("/v1/filter", &body).messages()), [""; 0]);
-    let short = Local::start(|config| config.memory = ByteSize(memory(exact).0 * 4 / 5));
+    let short = start(&["--memory", &memory(exact * 4 / 5)]);
     let problem = short.post("/v1/filter", &body).problem(413, "over_memory");
     let fits = problem["fits"][0].as_u64().unwrap();
     assert!(problem["needed"].as_u64() == Some(exact) && (1..64).contains(&fits), "{problem}");
@@ -269,20 +250,14 @@ fn a_varying_tile_is_admitted_by_its_counts() {
 #[test]
 fn requests_take_memory_too() {
     // Room for one request at a time.
-    let server = Local::start(|config| {
-        config.memory = ByteSize(1 << 20);
-        config.queue_deadline = Duration::from_millis(200);
-    });
-    let body = tile([16, 16], Rect::new(0, 0, 16, 16), 0);
-    let half = server.send("/v1/filter", &body[..body.len() / 2], body.len());
-    let mut answer = server.get("/v1/images");
-    while answer.status == 200 {
-        // The half tile was not there yet.
-        answer = server.get("/v1/images");
-    }
-    answer.problem(503, "busy");
+    let server = start(&["--memory", "1MiB", "--queue-deadline", "200ms"]);
+    let body = whole(16);
+    let half = server.begin("/v1/filter", &[], &body[..body.len() / 2], body.len());
+    server.get("/v1/images").problem(503, "busy");
     assert_eq!(server.get("/livez").status, 200);
     drop(half);
-    while server.get("/v1/images").status != 200 {}
+    wait_until("its memory is free", || server.metric(MEMORY_USED) == Some(0.0));
+    assert_eq!(server.get("/v1/images").status, 200);
+    wait_until("its memory is free", || server.metric(MEMORY_USED) == Some(0.0));
     assert_eq!(server.post("/v1/filter", &body).messages().len(), 2);
 }

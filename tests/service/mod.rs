@@ -36,6 +36,17 @@ use rpfd::{
 };
 use serde_json::Value;
 
+/// No deadline ends anything that a test does not mean to be ended, however slow the machine: a test that is about one
+/// sets it.
+const PATIENT: [(&str, &str); 4] = [
+    ("RPFD_HEADER_DEADLINE", "10m"),
+    ("RPFD_IDLE_DEADLINE", "10m"),
+    ("RPFD_QUEUE_DEADLINE", "10m"),
+    ("RPFD_SHUTDOWN_DEADLINE", "10m"),
+];
+/// What a machine that stalls may take for anything; it is waited for that long only if it does not come.
+const LATEST: Duration = Duration::from_secs(600);
+
 /// A running service, which ends with this.
 pub(crate) struct Server {
     child: Child,
@@ -79,6 +90,7 @@ impl Server {
             .arg(folder.path())
             .args(arguments)
             .env("RUST_LOG", if arguments.contains(&"--log-format") { "info" } else { "warn" })
+            .envs(PATIENT)
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
@@ -126,7 +138,8 @@ impl Server {
 
     pub(crate) fn connect(&self) -> TcpStream {
         let stream = TcpStream::connect(&self.address).unwrap();
-        stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+        stream.set_read_timeout(Some(LATEST)).unwrap();
+        stream.set_write_timeout(Some(LATEST)).unwrap();
         stream
     }
 
@@ -134,12 +147,35 @@ impl Server {
     pub(crate) fn call(&self, method: &str, path: &str, headers: &[&str], body: &[u8]) -> Answer {
         let mut stream = self.connect();
         let mut writer = stream.try_clone().unwrap();
-        let head = head(method, path, headers, body.len());
+        // At once: a small body does not come later than its head.
+        let request = [head(method, path, headers, body.len()).as_bytes(), body].concat();
         std::thread::scope(|scope| {
             // An early answer may close the connection under us.
-            scope.spawn(move || writer.write_all(head.as_bytes()).and_then(|()| writer.write_all(body)));
+            scope.spawn(move || writer.write_all(&request));
             Answer::read(&mut stream)
         })
+    }
+
+    /// Sends a request at once, of whose body of this length so much comes. The service may close its end early.
+    pub(crate) fn send(&self, path: &str, headers: &[&str], body: &[u8], length: usize) -> TcpStream {
+        let mut stream = self.connect();
+        let _ = stream.write_all(&[head("POST", path, headers, length).as_bytes(), body].concat());
+        stream
+    }
+
+    /// The same, once the service has let the request in: it asks for the body then.
+    pub(crate) fn begin(&self, path: &str, headers: &[&str], body: &[u8], length: usize) -> TcpStream {
+        self.try_begin(path, headers, body, length).expect("a request is let in")
+    }
+
+    /// The same, unless it is not let in.
+    pub(crate) fn try_begin(&self, path: &str, headers: &[&str], body: &[u8], length: usize) -> Option<TcpStream> {
+        const GO_ON: &[u8] = b"HTTP/1.1 100 Continue\r\n\r\n";
+        let mut stream = self.send(path, &[headers, &["Expect: 100-continue"]].concat(), &[], length);
+        let mut answer = [0; GO_ON.len()];
+        stream.read_exact(&mut answer).ok().filter(|()| answer == GO_ON)?;
+        stream.write_all(body).unwrap();
+        Some(stream)
     }
 
     pub(crate) fn get(&self, path: &str) -> Answer {
@@ -264,14 +300,20 @@ pub(crate) fn has(tool: &str, argument: &str) -> bool {
     }
 }
 
-/// Waits until something is so, for half a minute at most.
+/// Waits until something is so.
 #[track_caller]
 pub(crate) fn wait_until(what: &str, mut so: impl FnMut() -> bool) {
     let started = std::time::Instant::now();
     while !so() {
-        assert!(started.elapsed() < Duration::from_secs(30), "in vain: {what}");
+        assert!(started.elapsed() < LATEST, "waited in vain: {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
+}
+
+/// Waits for something.
+#[track_caller]
+pub(crate) fn wait_for(what: &str, done: impl FnMut() -> bool) {
+    wait_until(what, done);
 }
 
 fn unchunked(mut bytes: &[u8]) -> Vec<u8> {
@@ -317,17 +359,6 @@ pub(crate) fn encode(tile: &SampleTile) -> Vec<u8> {
 
 pub(crate) fn tile(image: [u32; 2], core: Rect, halo: u32) -> Vec<u8> {
     encode(&samples(image, core, halo, 1))
-}
-
-/// Waits until a question is answered with yes; long enough for the slowest machine.
-pub(crate) fn wait_for(what: &str, mut done: impl FnMut() -> bool) {
-    for _ in 0..1200 {
-        if done() {
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(50));
-    }
-    panic!("waited in vain for {what}");
 }
 
 /// A small image as one tile.

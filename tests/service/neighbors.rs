@@ -14,6 +14,7 @@ use rpfd::{
 use serde_json::{Value, json};
 use std::{
     os::unix::fs::MetadataExt,
+    panic::{AssertUnwindSafe, catch_unwind},
     path::Path,
     sync::{Arc, atomic::AtomicBool},
 };
@@ -36,6 +37,12 @@ fn open(server: &Server, size: [u32; 2], preset: &str) {
 
 pub(crate) fn wait_complete(server: &Server, id: &str) {
     wait_for("an image to be complete", || server.get(&format!("/v1/images/{id}")).json()["complete"] == true);
+}
+
+/// Waits until hardly any samples are left on the disk.
+fn wait_dropped(server: &Server) {
+    let samples = server.data_dir().join("images/a/samples");
+    wait_for("all samples to be dropped", || std::fs::metadata(&samples).unwrap().blocks() * 512 <= 8192);
 }
 
 fn states(lines: &[Value]) -> Vec<&str> {
@@ -77,8 +84,7 @@ fn bare_cores_in_any_order_are_the_whole_image() {
         // All samples are dropped, and known all the same.
         let lines = server.post("/v1/images/a/tiles", &bodies[0]).lines();
         assert_eq!(states(&lines), ["repeated", "end"]);
-        let kept = std::fs::metadata(server.data_dir().join("images/a/samples")).unwrap();
-        assert!(kept.blocks() * 512 <= 8192, "{} bytes of samples are kept", kept.blocks() * 512);
+        wait_dropped(&server);
     }
 }
 
@@ -304,8 +310,7 @@ fn any_mixture_is_the_whole_image() {
         wait_complete(&server, "a");
         let exr = server.get("/v1/images/a/result.exr").body;
         assert!(exr == whole_exr(&whole, &Method::preset(preset).unwrap(), 5), "{preset}, {side}: another image");
-        let kept = std::fs::metadata(server.data_dir().join("images/a/samples")).unwrap();
-        assert!(kept.blocks() * 512 <= 8192, "{} bytes of samples are kept", kept.blocks() * 512);
+        wait_dropped(&server);
     }
 }
 
@@ -359,9 +364,12 @@ fn a_region_that_takes_too_long_is_stopped() {
     opening["fractions"] = json!([4, 4, 4, 4]);
     assert_eq!(server.post("/v1/images", opening.to_string().as_bytes()).status, 201);
     server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(0, 0, 48, 48), 0)).lines();
-    let trouble = || server.get("/v1/images/a").json()["trouble"].clone();
-    wait_for("the time to be up", || trouble()["code"] == "work_timeout");
-    assert!(trouble()["detail"].as_str().unwrap().contains("smaller parts"), "{}", trouble());
+    let mut trouble = Value::Null;
+    wait_for("the time to be up", || {
+        trouble = server.get("/v1/images/a").json()["trouble"].clone();
+        trouble["code"] == "work_timeout"
+    });
+    assert!(trouble["detail"].as_str().unwrap().contains("smaller parts"), "{trouble}");
     wait_for("its memory to be free", || server.metric("rpfd_memory_used_bytes") == Some(0.0));
     assert!(server.metric("rpfd_regions_total{outcome=\"failed\"}") >= Some(1.0));
     // It is tried again, until the image is forgotten.
@@ -411,6 +419,27 @@ fn a_region_that_was_stopped_is_filtered_in_parts() {
     assert!(!spent.filter.is_zero() && !spent.read.is_zero() && !spent.write.is_zero());
     let tiles = image.read().stitcher().tiles().count();
     assert!(tiles == 4 && image.read().stitcher().is_complete());
+    assert!(exr_of(&image, &method) == whole_exr(&whole, &method, 5));
+}
+
+#[test]
+fn a_region_whose_filtering_panics_is_filtered_again() {
+    const SIZE: [u32; 2] = [64, 48];
+    let (folder, method) = (tempfile::tempdir().unwrap(), Method::preset("lean").unwrap());
+    let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
+    create(folder.path(), &whole, &method, 64);
+    let image = reopen(folder.path());
+    image.offer(&whole, false).unwrap();
+    image.flush().unwrap();
+    let job = image.next_job(1, u64::MAX, u64::MAX).unwrap().unwrap();
+    assert!(image.next_job(1, u64::MAX, u64::MAX).unwrap().is_none() && !image.read().idle());
+    let panics = |_: f32| panic!("on purpose");
+    let execution = Execution { progress: Some(&panics), ..Execution::default() };
+    assert!(catch_unwind(AssertUnwindSafe(|| image.run(&job, &execution))).is_err());
+    assert!(image.read().idle(), "it is still at work");
+    let again = image.next_job(1, u64::MAX, u64::MAX).unwrap().expect("the region is given back");
+    image.run(&again, &Execution::default()).unwrap();
+    assert!(image.read().idle() && image.read().complete());
     assert!(exr_of(&image, &method) == whole_exr(&whole, &method, 5));
 }
 

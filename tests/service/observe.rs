@@ -91,9 +91,13 @@ fn labels_are_few_whatever_is_sent() {
         server.call(&format!("METHOD{i}"), &format!("/other/{i}"), &[], &[]);
         server.post(&format!("/v1/filter?parameter{i}=1"), &[]);
     };
+    // The last of them is counted when all of its answer is sent.
+    let counted = || super::wait_until("all is counted", || server.metric("rpfd_requests_in_flight") == Some(0.0));
     ask(0);
+    counted();
     let before = series(&server.metrics());
     (1..20).for_each(ask);
+    counted();
     assert_eq!(series(&server.metrics()), before);
 }
 
@@ -174,16 +178,22 @@ fn prometheus_reads_it() {
         .replace("scrape_interval: 15s", "scrape_interval: 1s");
     std::fs::write(folder.path().join("prometheus.yml"), text).unwrap();
     std::fs::copy(root.join("alerts.yml"), folder.path().join("alerts.yml")).unwrap();
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let log = folder.path().join("log");
     let mut child = Command::new("prometheus")
         .arg(format!("--config.file={}", folder.path().join("prometheus.yml").display()))
         .arg(format!("--storage.tsdb.path={}", folder.path().join("data").display()))
-        .arg(format!("--web.listen-address={port}"))
-        .stderr(std::fs::File::create(folder.path().join("log")).unwrap())
+        .arg("--web.listen-address=127.0.0.1:0")
+        .stderr(std::fs::File::create(&log).unwrap())
         .spawn()
         .unwrap();
+    // It says which port it got.
+    let address = || {
+        let said = std::fs::read_to_string(&log).unwrap();
+        let address = said.split("msg=\"Listening on\" address=").nth(1)?.split_once('\n')?.0.to_owned();
+        Some(address)
+    };
     let ask = |query: &str| {
-        let mut stream = std::net::TcpStream::connect(port).ok()?;
+        let mut stream = std::net::TcpStream::connect(address()?).ok()?;
         let path = format!("/api/v1/query?query={query}");
         stream.write_all(head("GET", &path, &[], 0).as_bytes()).ok()?;
         let answer = super::Answer::read(&mut stream);

@@ -4,7 +4,7 @@ use super::{Answer, Server, has, tile};
 use crate::cli::{Folder, data, rpfd, stderr};
 use rpfd::filter::Rect;
 use std::{
-    net::{TcpListener, TcpStream},
+    net::TcpListener,
     path::Path,
     process::{Child, Command},
 };
@@ -24,8 +24,13 @@ impl Drop for Proxy {
     }
 }
 
-/// Starts nginx with the example, its addresses and files replaced by those of the test.
+/// Starts nginx on a port that is free; if somebody else takes it meanwhile, on another.
 fn proxy(server: &Server) -> Proxy {
+    (0..20).find_map(|_| try_proxy(server)).expect("a port that stays free")
+}
+
+/// Starts nginx with the example, its addresses and files replaced by those of the test.
+fn try_proxy(server: &Server) -> Option<Proxy> {
     let folder = Folder::new();
     let (ca, ca_key) = (folder.path("ca.pem"), folder.path("ca.key"));
     let (certificate, key) = (folder.path("cert.pem"), folder.path("key.pem"));
@@ -63,9 +68,14 @@ fn proxy(server: &Server) -> Proxy {
     );
     let path = folder.path("nginx.conf");
     std::fs::write(&path, main).unwrap();
-    let child = Command::new("nginx").args(["-c", &path, "-e", &log]).spawn().unwrap();
-    super::wait_until("nginx listens", || TcpStream::connect(port).is_ok());
-    Proxy { child, folder, address: format!("localhost:{}", port.port()) }
+    let mut child = Command::new("nginx").args(["-c", &path, "-e", &log]).spawn().unwrap();
+    // It says who it is when it listens.
+    let mut ended = false;
+    super::wait_until("nginx listens", || {
+        ended = child.try_wait().unwrap().is_some();
+        ended || std::fs::read_to_string(&pid).is_ok_and(|id| !id.is_empty())
+    });
+    (!ended).then(|| Proxy { child, folder, address: format!("localhost:{}", port.port()) })
 }
 
 #[test]

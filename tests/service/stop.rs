@@ -1,19 +1,16 @@
 //! Stopping: what has begun ends, nothing new begins, and the end comes within its time.
 
-use super::{Answer, Server, head, wait_until, whole};
+use super::{Answer, Server, wait_until, whole};
 use std::{
     io::{Read, Write},
     net::TcpStream,
-    time::Duration,
 };
 
 #[test]
 fn what_has_begun_ends_while_nothing_new_begins() {
-    let server = Server::start(&["--metrics-listen", "127.0.0.1:0", "--shutdown-deadline", "60s"]);
+    let server = Server::start(&["--metrics-listen", "127.0.0.1:0"]);
     let body = whole(16);
-    let mut busy = server.connect();
-    busy.write_all(head("POST", "/v1/filter", &[], body.len()).as_bytes()).unwrap();
-    busy.write_all(&body[..body.len() / 2]).unwrap();
+    let mut busy = server.send("/v1/filter", &[], &body[..body.len() / 2], body.len());
     wait_until("the request is under way", || server.metric("rpfd_requests_in_flight") == Some(1.0));
     let mut idle = server.connect();
     idle.write_all(b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\n").unwrap();
@@ -30,13 +27,10 @@ fn what_has_begun_ends_while_nothing_new_begins() {
 
 #[test]
 fn the_end_comes_whoever_dawdles() {
-    let server = Server::start(&["--shutdown-deadline", "300ms", "--idle-deadline", "1h"]);
+    let server = Server::start(&["--shutdown-deadline", "300ms"]);
     let body = whole(16);
-    let mut slow = server.connect();
-    slow.write_all(head("POST", "/v1/filter", &[], body.len()).as_bytes()).unwrap();
-    slow.write_all(&body[..body.len() / 2]).unwrap();
+    let _slow = server.begin("/v1/filter", &[], &body[..body.len() / 2], body.len());
     let mut silent = server.connect();
     silent.write_all(b"G").unwrap();
-    std::thread::sleep(Duration::from_millis(200));
     assert_eq!(server.terminate().code(), Some(0));
 }

@@ -1,15 +1,11 @@
 //! Who may do what.
 
-use super::{Answer, Server, head, wait_until, whole};
+use super::{Answer, Server, wait_until, whole};
 use crate::{
     cli::{Folder, data, fails, rpfd, stderr},
     wire::interop::{CLIENT, run_python},
 };
-use std::{
-    io::{Read, Write},
-    path::Path,
-    process::Command,
-};
+use std::{io::Write, path::Path, process::Command};
 
 /// Makes tokens with the real command, and gives them; their entries go to one file.
 fn tokens(folder: &Folder, wanted: &[(&str, &str)]) -> (String, Vec<String>) {
@@ -65,12 +61,13 @@ fn a_token_is_needed_and_its_role() {
 fn tokens_are_read_again_and_a_bad_file_changes_nothing() {
     let folder = Folder::new();
     let (file, first) = tokens(&folder, &[("old", "read")]);
-    let server = Server::start(&["--token-file", &file]);
+    let log = folder.path("log");
+    let server = Server::start_logging(&["--token-file", &file], Some(log.as_ref()));
     let status = |token: &str| server.call("GET", "/v1/images", &[&bearer(token)], &[]).status;
     assert_eq!(status(&first[0]), 200);
     std::fs::write(&file, "[[token]]\nname = 'x'").unwrap();
     server.signal("-HUP");
-    std::thread::sleep(std::time::Duration::from_millis(300));
+    wait_until("the file is refused", || std::fs::read_to_string(&log).unwrap().contains("tokens not read again"));
     assert_eq!(status(&first[0]), 200);
     std::fs::remove_file(folder.path("old.token")).unwrap();
     let (_, second) = tokens(&folder, &[("new", "read")]);
@@ -179,20 +176,10 @@ fn requests_at_once_are_limited() {
     let limited = std::fs::read_to_string(&file).unwrap().replacen("roles", "requests = 1\nroles", 1);
     std::fs::write(&file, limited).unwrap();
     let server = Server::start(&["--token-file", &file, "--requests", "2"]);
-    let begin = |token: &str| {
-        let mut stream = server.connect();
-        let body = whole(16);
-        let headers = [&*bearer(token), "Expect: 100-continue"];
-        stream.write_all(head("POST", "/v1/filter", &headers, body.len()).as_bytes()).unwrap();
-        // It has been let in when its body is asked for.
-        let mut answer = [0; b"HTTP/1.1 100 Continue\r\n\r\n".len()];
-        stream.read_exact(&mut answer).unwrap();
-        assert_eq!(String::from_utf8_lossy(&answer), "HTTP/1.1 100 Continue\r\n\r\n");
-        stream.write_all(&body[..body.len() / 2]).unwrap();
-        (stream, body)
-    };
+    let body = whole(16);
+    let begin = |token: &str| server.begin("/v1/filter", &[&bearer(token)], &body[..body.len() / 2], body.len());
     let status = |token: &str| server.call("POST", "/v1/filter", &[&bearer(token)], b"").status;
-    let (mut first, body) = begin(&tokens[0]);
+    let mut first = begin(&tokens[0]);
     assert_eq!(status(&tokens[0]), 429);
     let answer = server.call("POST", "/v1/filter", &[&bearer(&tokens[0])], b"");
     assert!(answer.problem(429, "too_many_requests")["detail"].as_str().unwrap().contains("with this token"));
