@@ -1,7 +1,7 @@
 //! What a request takes beside its tiles: the buffers of its connection and of its answer, and the window of a
 //! decompressor. A share of the memory is set aside for this, so that tiles and requests never wait for each other in a
 //! circle: who holds memory for a tile takes from this share only what is free, and who waits for a wide window holds
-//! nothing.
+//! nothing. Who waits for the counts of a tile holds a request, and so there is a part of the share for these alone.
 
 use std::{
     pin::Pin,
@@ -31,10 +31,12 @@ pub(super) const REQUEST: u64 = 256 << 10;
 /// The window that is taken from the start for a body in zstd: that of its default level.
 const WINDOW: u64 = 2 << 20;
 
-/// Memory that is set aside for requests, of so much in all: a quarter up to 64 MiB, then an eighth.
-pub(super) const fn share(memory: u64) -> u64 {
-    let quarter = if memory / 4 < 64 << 20 { memory / 4 } else { 64 << 20 };
-    if memory / 8 > quarter { memory / 8 } else { quarter }
+/// What of so much memory is for tiles, for requests, and for the counts of tiles that vary in them. Requests have a
+/// quarter up to 64 MiB, then an eighth; of that, a quarter is for counts.
+pub(super) fn shares(memory: u64) -> [u64; 3] {
+    let share = (memory / 4).min(64 << 20).max(memory / 8);
+    let counts = share / 4;
+    [memory - share, share - counts, counts]
 }
 
 /// The permit of a request: it lasts until request and answer are both done with.

@@ -285,10 +285,10 @@ impl Metrics {
     /// All of it as text. Blocks.
     fn render(&self, service: &Shared) -> Result<String, Refusal> {
         let bytes = |bytes: u64| i64::try_from(bytes).unwrap_or(i64::MAX);
-        let (tiles, requests, unread) = (&service.budget, &service.requests, &service.unread);
+        let (tiles, requests, counts, unread) = (&service.budget, &service.requests, &service.counts, &service.unread);
         let used = |budget: &Budget| budget.total() - budget.free();
-        self.memory_limit.set(bytes(tiles.total() + requests.total()));
-        self.memory_used.set(bytes(used(tiles) + used(requests)));
+        self.memory_limit.set(bytes(tiles.total() + requests.total() + counts.total()));
+        self.memory_used.set(bytes(used(tiles) + used(requests) + used(counts)));
         self.unread_limit.set(bytes(unread.total()));
         self.unread_used.set(bytes(used(unread)));
         self.images.set(bytes(service.images.count() as u64));

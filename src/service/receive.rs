@@ -203,7 +203,7 @@ async fn announce(call: &Call, header: Header) -> Result<Open, Fault> {
         return admit(call, assembler, unread, header.max_per_pixel()).await;
     }
     let left = geometry.window().area();
-    let held = service.requests.reserve(count_bytes(left), deadline).await.map_err(|error| tile(error.into()))?;
+    let held = service.counts.reserve(count_bytes(left), deadline).await.map_err(|error| tile(error.into()))?;
     let (counts, most) = (CountReader::default(), 0);
     Ok(Open::Counting(Counting { assembler, unread, counts, most, left, _held: held }))
 }
@@ -270,7 +270,7 @@ fn largest_core(header: &Header, shape: &Shape, call: &Call) -> Option<u32> {
             let shape = Shape { geometry: &geometry, samples, ..*shape };
             let counts = if shape.varying { count_bytes(geometry.window().area()) } else { 0 };
             service.budget.check(call.plan(&shape).total(service.config.threads)).is_ok()
-                && service.requests.check(counts).is_ok()
+                && service.counts.check(counts).is_ok()
         })
     };
     // The need grows with the side.

@@ -216,7 +216,7 @@ fn a_full_queue_refuses_at_once_and_says_when_to_come_again() {
     let header = Header::of(&samples([48, 48], rect, 0, 1), Format::F32).unwrap();
     let body = tile([48, 48], rect, 0);
     let server = Local::start(|config| {
-        config.memory = memory(needed(&header, &Method::default()));
+        config.memory = ByteSize(memory(needed(&header, &Method::default())).0 * 3 / 2);
         config.queue = 1;
     });
     // One holds the memory, one waits; the third does not wait for its deadline of a minute.
@@ -263,6 +263,24 @@ fn a_varying_tile_is_admitted_by_its_counts() {
     let header = Header::new(geometry, tile.channels().clone(), counts, Format::F32);
     if let Ok(header) = header {
         short.post("/v1/filter", &encode_header(&header)).problem(413, "over_memory");
+    }
+}
+
+/// Requests that hold all memory there is for requests need none of it to go on.
+#[test]
+fn tiles_whose_counts_vary_do_not_wait_for_each_other() {
+    // Room for six requests and their counts; eight come, of each a part at first.
+    let server = Local::start(|config| config.memory = ByteSize(8 << 20));
+    let geometry = TileGeometry::with_halo([16, 16], Rect::new(0, 0, 16, 16), 0).unwrap();
+    let tile = Scene::by_name("all").unwrap().tile_varying(geometry, 2, &Execution::default()).unwrap();
+    let body = super::encode(&tile);
+    let begin = |_| server.send("/v1/filter?preset=gaussian", &body[..8], body.len());
+    let mut streams: Vec<TcpStream> = (0..8).map(begin).collect();
+    for stream in &mut streams {
+        stream.write_all(&body[8..]).unwrap();
+    }
+    for stream in &mut streams {
+        assert_eq!(codes(&Answer::read(stream).messages()), [""; 0]);
     }
 }
 

@@ -99,7 +99,7 @@ fn nobody_has_to_read_while_sending() {
 
 #[test]
 fn a_client_that_only_sends_gets_its_refusal() {
-    let server = Server::start(&["--memory", "4MiB"]);
+    let server = Server::start(&["--memory", "8MiB"]);
     let body = whole(320);
     let zstd = ["Content-Encoding: zstd"];
     for (path, headers, status, code) in [
