@@ -3,7 +3,10 @@
 use super::{Answer, head, samples, tile};
 use rpfd::{
     config::{ByteSize, Config},
-    filter::{Channel, ChannelSet, Execution, Method, Rect, Role, TileGeometry, plan::Shape, plan::plan},
+    filter::{
+        Channel, ChannelSet, Counts, Execution, Method, Plane, Rect, Role, SampleTile, TileGeometry,
+        plan::{Shape, plan},
+    },
     service::Service,
     synth::Scene,
     wire::{Format, Header, Message, SampleCounts, encode_header},
@@ -303,4 +306,28 @@ fn requests_take_memory_too() {
     drop(half);
     while server.get("/v1/images").status != 200 {}
     assert_eq!(server.post("/v1/filter", &body).messages().len(), 2);
+}
+
+/// Whatever else the tile would have to wait for.
+#[test]
+fn counts_that_never_fit_are_refused_at_once_with_the_size_that_would() {
+    let varying = |side: u32| {
+        let geometry = TileGeometry::with_halo([side, side], Rect::new(0, 0, side, side), 0).unwrap();
+        let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+        let counts = Counts::Varying((0..side * side).map(|i| 1 + (i % 2) as u16).collect());
+        let planes = [1.0, 2.0, 3.0].map(Plane::Constant).to_vec();
+        super::encode(&SampleTile::new(geometry, channels, counts, planes).unwrap())
+    };
+    // Half a MiB for counts.
+    let [no_room, room] = [1, 4096].map(|unread| {
+        Local::start(|config| {
+            config.memory = ByteSize(8 << 20);
+            config.unread_results = ByteSize(unread << 20);
+        })
+    });
+    let problem = no_room.post("/v1/filter?preset=unfiltered", &varying(600)).problem(413, "over_memory");
+    assert_eq!((problem["needed"].as_u64(), problem["available"].as_u64()), (Some(720_000), Some(1 << 19)));
+    let fits = problem["fits"][0].as_u64().unwrap() as u32;
+    assert!((64..512).contains(&fits), "{problem}");
+    assert_eq!(codes(&room.post("/v1/filter?preset=unfiltered", &varying(fits)).messages()), [""; 0]);
 }
