@@ -115,8 +115,9 @@ async fn run(service: Shared, mut opened: Opened) {
         let runner = &opened.entry.runner;
         runner.running.store(false, Ordering::SeqCst);
         // What came after the last look and before this was not seen by anybody.
-        let more = opened.image.read().regions().is_some_and(|regions| regions.ready() > 0);
-        if !more || runner.running.swap(true, Ordering::SeqCst) {
+        let image = Arc::clone(&opened.image);
+        let more = blocking(move || image.read().regions().is_some_and(|regions| regions.ready() > 0));
+        if !more.await.unwrap_or(false) || runner.running.swap(true, Ordering::SeqCst) {
             return;
         }
     }
@@ -180,7 +181,13 @@ async fn filter(service: Shared, opened: Opened, job: Job) -> Result<(), Refusal
         () = runner.stop.cancelled() => Err(stopped()),
     };
     drop(waiting);
-    let permit = permit.inspect_err(|_| image.give_back(&job))?;
+    let permit = match permit {
+        Ok(permit) => permit,
+        Err(refusal) => {
+            blocking(move || image.give_back(&job)).await?;
+            return Err(refusal);
+        }
+    };
     service.spare.make_room();
     metrics.phase(Phase::Queue, asked);
     let (shared, entry, ready) = (Arc::clone(&service), Arc::clone(&opened.entry), Instant::now());
