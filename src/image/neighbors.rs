@@ -257,6 +257,14 @@ impl Neighbors {
         self.regions.give_back(region);
     }
 
+    pub(super) fn set_aside(&mut self, region: u32) {
+        self.regions.set_aside(region);
+    }
+
+    pub(super) fn retry(&mut self) {
+        self.regions.retry();
+    }
+
     /// A tile of a region that is provisional.
     pub(super) fn doubt(&mut self, region: u32, tile: Rect) {
         let tiles = self.provisional.entry(region).or_default();

@@ -5,7 +5,7 @@ use std::{
     fs::File,
     io::{self, Write},
     sync::{
-        Arc, PoisonError,
+        Arc,
         atomic::{AtomicBool, Ordering},
     },
 };
@@ -130,8 +130,7 @@ impl Opened {
             .map(|((plane, reason), tiles)| json!({ "plane": plane, "reason": reason, "tiles": tiles }))
             .collect();
         if inner.regions().is_some() {
-            let trouble = self.entry.runner.trouble.lock().unwrap_or_else(PoisonError::into_inner);
-            status["trouble"] = json!(*trouble);
+            status["trouble"] = json!(self.entry.runner.told());
         }
         // The object, but for its last brace.
         let mut head = status.to_string();
@@ -155,6 +154,7 @@ impl Opened {
                     RegionState::Waiting => "waiting",
                     RegionState::Ready | RegionState::Done => "ready",
                     RegionState::Running => "running",
+                    RegionState::TooLarge => "too_large",
                     RegionState::Filtered => "filtered",
                 };
                 let mut region = json!({ "region": corners(regions.core(index)), "state": state });
@@ -183,7 +183,12 @@ impl Opened {
             let (snapshot, settled, replacements) = {
                 let inner = self.image.read();
                 let settled = inner.settled();
-                check_complete(&inner, partial || settled && inner.finished())?;
+                check_complete(&inner, partial || settled && inner.finished()).map_err(|mut refusal| {
+                    if let Some(trouble) = self.entry.runner.told() {
+                        refusal.0.more.insert("trouble".to_owned(), json!(trouble));
+                    }
+                    refusal
+                })?;
                 let (pixels, missing) = (inner.stitcher().pixels(), inner.stitcher().check_complete(true)?);
                 (Snapshot { pixels, missing, stop }, settled, inner.replacements())
             };

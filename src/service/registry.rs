@@ -136,7 +136,7 @@ impl Entry {
 
     /// Whether somebody is at work on it, or reads its result. Who tries in vain is not at work.
     fn is_used(&self, slot: &Slot) -> bool {
-        self.is_read() || self.runner.untroubled() && slot.is_used()
+        self.is_read() || self.runner.told().is_none() && slot.is_used()
     }
 
     /// Whether somebody reads the result that the image keeps, or kept.

@@ -20,6 +20,7 @@ mod proxy;
 mod recovering;
 mod stop;
 mod tokens;
+mod too_large;
 
 use std::{
     io::{BufRead, BufReader, Read, Write},
