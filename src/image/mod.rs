@@ -13,6 +13,7 @@
 mod announced;
 pub mod description;
 mod error;
+mod index;
 mod inner;
 mod jobs;
 mod neighbors;
@@ -22,11 +23,13 @@ pub mod regions;
 pub use announced::keeping;
 pub use description::{Announced, Description, disk_bytes};
 pub use error::ImageError;
+pub use index::INDEX_STEP;
 pub use jobs::{Job, Spent};
 pub use regions::{RegionState, Regions};
 
 use std::{
     collections::HashMap,
+    convert::Infallible,
     fs::File,
     io,
     path::Path,
@@ -40,8 +43,8 @@ use crate::{
     disk::Folder,
     filter::{ChannelSet, Filtered, Rect, SampleTile, Stopped},
     stitch::{
-        Added, Canvas, CanvasError, Claim, Digest, ExrOptions, Offer, Pixels, StitchError, Stitcher, Verdict, canvas::Checksum,
-        digest::digest,
+        Added, Canvas, CanvasError, Claim, Digest, ExrOptions, Offer, Pixels, StitchError, Stitcher, Verdict,
+        canvas::Checksum, digest::digest,
     },
     store::{Change, Records, State, StateError, samples, state},
 };
@@ -163,9 +166,19 @@ impl Image {
 
     /// Opens an image that is in a folder, as it was when it was last heard of. What was not committed is given up.
     pub fn open(folder: Box<dyn Folder>) -> Result<Self, ImageError> {
+        Ok(Self::open_within(folder, |_| Ok::<_, Infallible>(()))?.unwrap_or_else(|never| match never {}))
+    }
+
+    /// As [`Self::open`], if so many bytes of memory may be taken.
+    pub fn open_within<E>(
+        folder: Box<dyn Folder>,
+        admit: impl FnOnce(u64) -> Result<(), E>,
+    ) -> Result<Result<Self, E>, ImageError> {
         let state = State::open(&*folder)?;
-        let description = state.fact("image")?.and_then(|bytes| Description::decode(&bytes));
-        let description = description.ok_or_else(|| state.damaged("it does not say how the image was opened"))?;
+        let description = index::described(&state)?;
+        if let Err(refused) = admit(index::stored_bytes(&state, &description)?) {
+            return Ok(Err(refused));
+        }
         let [width, height] = description.size;
         let canvas = Canvas::open(width, height, &*folder, CANVAS)?;
         if let Some(bytes) = state.fact(REPLACEMENT)? {
@@ -219,7 +232,7 @@ impl Image {
             replacements: 0,
             result: None,
         };
-        Ok(Self {
+        Ok(Ok(Self {
             folder,
             description,
             canvas,
@@ -228,7 +241,7 @@ impl Image {
             channels: channels.map_or_else(OnceLock::new, OnceLock::from),
             failed: OnceLock::new(),
             writing: RwLock::new(()),
-        })
+        }))
     }
 
     /// How it was opened.

@@ -188,6 +188,11 @@ impl Neighbors {
         &self.regions
     }
 
+    /// Cores and parts of halos that are known.
+    pub(super) fn entries(&self) -> usize {
+        self.cores.len() + self.lent.len()
+    }
+
     pub(super) fn count(&self) -> (usize, u64) {
         (self.cores.len(), self.pixels)
     }

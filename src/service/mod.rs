@@ -14,6 +14,7 @@ mod connection;
 mod health;
 mod images;
 mod inflate;
+mod known;
 mod metrics;
 mod openapi;
 mod opened;
@@ -197,9 +198,9 @@ impl Service {
         let (listener, address) = listen(config.listen)?;
         let metrics = config.metrics_listen.map(listen).transpose()?;
         let of = |bytes| Budget::new(bytes, config.queue);
-        let ([budget, requests, counts], unread) =
+        let ([budget, requests, counts, memory], unread) =
             (charge::shares(config.memory.0).map(of), of(config.unread_results.0));
-        let (images, found) = Images::start(&config).map_err(|error| match error {
+        let (images, found) = Images::start(&config, memory).map_err(|error| match error {
             StartError::InUse => ServeError::InUse { path: config.data_dir.clone() },
             StartError::Io(source) => data_dir(source),
         })?;

@@ -55,7 +55,8 @@ impl Opened {
     }
 
     /// Asks whether a tile is wanted. Blocks.
-    pub(super) fn offer(&self, tile: &SampleTile, replace: bool) -> Result<Outcome, Refusal> {
+    pub(super) fn offer(&self, tile: &SampleTile, replace: bool, service: &Shared) -> Result<Outcome, Refusal> {
+        service.images.make_room(self)?;
         Ok(self.image.offer(tile, replace)?)
     }
 
@@ -84,10 +85,14 @@ impl Opened {
 mod tests {
     use super::*;
     use crate::{
+        admission::Budget,
         disk::Directory,
         filter::{Channel, Method, Rect, Role, TileGeometry},
         image::{Description, Image},
-        service::registry::{Entry, Id, Slot},
+        service::{
+            known::Memory,
+            registry::{Entry, Id, Slot},
+        },
         wire::{Format, SampleCounts},
     };
     use std::{sync::mpsc, thread, time::Duration};
@@ -107,11 +112,12 @@ mod tests {
         };
         Image::create(&Directory::new(folder.path()), &description).unwrap();
         let image = Arc::new(Image::open(Box::new(Directory::new(folder.path()))).unwrap());
-        let entry = Arc::new(Entry::new(Id::new(), None, 0, 0, Slot::Open(Arc::clone(&image))));
+        let entry = Arc::new(Entry::new(Id::new(), None, 0, 0, Slot::Gone));
         let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
         let geometry = TileGeometry::with_halo([64, 64], Rect::new(0, 0, 16, 16), 0).unwrap();
         let header = Header::new(geometry, channels, SampleCounts::Uniform(1), Format::F32).unwrap();
-        let opened = Opened { entry, image: Arc::clone(&image) };
+        let memory = Memory::new(Budget::new(0, 0).none());
+        let opened = Opened { entry, image: Arc::clone(&image), memory };
         thread::scope(|scope| {
             let held = image.read();
             // It waits to change the image, and everybody who wants to look at it waits behind it.

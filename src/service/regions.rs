@@ -209,16 +209,17 @@ async fn filter(service: Shared, opened: Opened, job: Job) -> Result<(), Refusal
     };
     service.spare.make_room();
     metrics.phase(Phase::Queue, asked);
-    let (shared, entry, ready) = (Arc::clone(&service), Arc::clone(&opened.entry), Instant::now());
+    let (shared, here, ready) = (Arc::clone(&service), opened.clone(), Instant::now());
     let work = service.work.run(move |pool, stop| {
         let _permit = permit;
         shared.metrics.phase(Phase::Turn, ready);
+        shared.images.make_room(&here).inspect_err(|_| image.give_back(&job))?;
         let simd = shared.config.simd;
         let execution = Execution { pool: Some(pool), stop: Some(stop), simd, ..Execution::default() };
         let done = image.run(&job, &execution);
         if let (Err(ImageError::Stopped(_)), false) = (&done, job.has_progress()) {
             // If it was not for the time, this image is not filtered any more.
-            entry.runner.too_long(&job);
+            here.entry.runner.too_long(&job);
         }
         Ok(done?)
     });

@@ -99,9 +99,9 @@ fn codes(messages: &[Message]) -> Vec<&str> {
     codes.into_iter().map(|code| &*code.leak()).collect()
 }
 
-/// Memory for a budget of so much for tiles, where a quarter is for requests.
+/// Memory for a budget of so much for tiles, where a quarter is for requests, and an eighth for images.
 const fn memory(tiles: u64) -> ByteSize {
-    ByteSize((tiles + 2) * 4 / 3)
+    ByteSize((tiles + 4) * 8 / 5)
 }
 
 fn needed(header: &Header, method: &Method) -> u64 {

@@ -11,12 +11,13 @@ use std::{io::Write, time::Duration};
 
 const IMAGE: [u32; 2] = [64, 64];
 
-/// Memory with which a service can take this tile, and no more beside it, as an argument: a quarter is for requests.
+/// Memory with which a service can take this tile, and no more beside it, as an argument: a quarter is for requests,
+/// and an eighth for images.
 fn memory(side: u32, method: &Method) -> String {
     let tile = samples(IMAGE, Rect::new(0, 0, side, side), 0, 1);
     let header = Header::of(&tile, Format::F32).unwrap();
     let threads = Config::default().threads;
-    ((plan(&header.shape(), method).total(threads) + 1024) * 4 / 3).to_string()
+    ((plan(&header.shape(), method).total(threads) + 1024) * 8 / 5).to_string()
 }
 
 #[test]

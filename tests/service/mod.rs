@@ -12,6 +12,7 @@ pub(crate) mod exact;
 pub(crate) mod flow;
 mod http2;
 mod images;
+mod index;
 mod limits;
 pub(crate) mod neighbors;
 mod observe;
