@@ -111,7 +111,8 @@ settings! {
         "DIR", |dir| !dir.as_os_str().is_empty(), "must name a folder";
 
     /// Memory for tiles at work (samples, the filter's buffers, results) and, a share of it (a quarter up to 64 MiB, then
-    /// an eighth), for requests. 1MiB to 4TiB less 1KiB
+    /// an eighth), for requests, and of that, a quarter, for the counts of tiles that vary in them; and half as much as that
+    /// share for what is known of images. 1MiB to 4TiB less 1KiB
     memory: ByteSize = ByteSize(1 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_MEMORY).contains(&size.0),
         "must be 1MiB to 4TiB less 1KiB";
 

@@ -134,3 +134,78 @@ fn plans_are_upper_bounds_and_tight() {
         }
     }
 }
+
+/// What is known of an image's tiles, cores and regions takes no more than it says, live and when it is opened again.
+#[cfg(feature = "program")]
+#[test]
+fn what_is_known_of_an_image_is_no_more_than_is_said() {
+    use rpfd::{
+        disk::Directory,
+        filter::geometry::tiling,
+        image::{Announced, Description, Image, Outcome, disk_bytes},
+    };
+    use std::sync::Arc;
+
+    const SIZE: [u32; 2] = [768, 512];
+    let _alone = COUNTING.lock();
+    let channels = channels(3, 2);
+    let method = Method::preset("unfiltered").expect("a preset");
+    let announced = |varying| Announced { channels: channels.clone(), samples: 1, varying, region: 16 };
+    let tile = |core: Rect, halo: u32| {
+        let geometry = TileGeometry::with_halo(SIZE, core, halo).expect("a valid geometry");
+        let planes = planes(&channels, geometry.window().area() as usize);
+        SampleTile::new(geometry, channels.clone(), Counts::Uniform(1), planes).expect("a valid tile")
+    };
+    let mut wrong = Vec::new();
+    // Tiles by rows and from all over; cores with and without halos that are kept.
+    for (neighbors, step) in [(None, 1), (None, 601), (Some(announced(false)), 1), (Some(announced(true)), 601)] {
+        let folder = tempfile::tempdir().expect("a folder");
+        // Regions that read their neighbours, so that halos are kept.
+        let keeps = neighbors.is_some();
+        let description = Description {
+            size: SIZE,
+            method: if keeps { Method::default() } else { method.clone() },
+            seed: 0,
+            leave_out: true,
+            neighbors,
+            owner: None,
+            disk: 0,
+        };
+        let description = Description { disk: disk_bytes(&description), ..description };
+        Image::create(&Directory::new(folder.path()), &description).expect("an image");
+        let cores: Vec<Rect> = tiling(SIZE, 16).collect();
+        let before = ALLOCATIONS.current_usage() as u64;
+        let mut check = |image: &Image, used: u64, what: &str| {
+            let said = image.read().index_bytes();
+            if used > said || said > 4 * used {
+                wrong.push(format!("{keeps}, {step}, {what}: {used} of {said} bytes"));
+            }
+        };
+        let open = || Arc::new(Image::open(Box::new(Directory::new(folder.path()))).expect("an image"));
+        let image = open();
+        for i in 0..cores.len() {
+            // Every fourth column, so that halos stay.
+            let core = cores[i * step % cores.len()];
+            if keeps && !(core.x / 16).is_multiple_of(4) {
+                continue;
+            }
+            let tile = tile(core, if keeps { 5 } else { 0 });
+            if let Outcome::Filter(claim) = image.offer(&tile, false).expect("a tile") {
+                let filtered = filter(&tile, &method, &Execution::default()).expect("nobody stops it");
+                image.add(claim, &filtered, 0.5).expect("a tile");
+            }
+            if i % 64 == 0 {
+                image.flush().expect("no error");
+            }
+        }
+        image.flush().expect("no error");
+        check(&image, ALLOCATIONS.current_usage() as u64 - before, "as they came");
+        image.close();
+        drop(image);
+        ALLOCATIONS.reset_peak_usage();
+        let before = ALLOCATIONS.current_usage() as u64;
+        let image = open();
+        check(&image, ALLOCATIONS.peak_usage() as u64 - before, "opened again");
+    }
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}

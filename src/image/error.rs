@@ -52,7 +52,8 @@ pub enum ImageError {
     },
     /// A region that cannot be filtered within the memory there is.
     #[error(
-        "tile {core} cannot be made smaller, needs {needed} bytes of memory with its halo, and {most} is all there is"
+        "tile {core} cannot be made smaller, needs {needed} bytes of memory with its halo, and {most} is all there is: \
+         start the service with more"
     )]
     TooLarge {
         /// A single pixel, or a tile that is to be filtered again.

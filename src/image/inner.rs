@@ -1,11 +1,11 @@
 //! What is known of an image in memory.
 
-use super::{After, ImageError, Inner, MAX_TILES, RESULT, Regions, neighbors::Neighbors, record::TileRecord};
+use super::{After, ImageError, Inner, MAX_TILES, RESULT, Regions, neighbors::Neighbors};
 use crate::{
     disk::Folder,
-    filter::{ChannelSet, Filtered, Rect, samples::Replaced},
-    stitch::{Digest, Offer, Stitcher, canvas::Checksum},
-    store::{Change, Records},
+    filter::{Rect, samples::Replaced},
+    stitch::{Digest, Offer, Stitcher},
+    store::Change,
 };
 
 impl Inner {
@@ -26,12 +26,6 @@ impl Inner {
             return Err(ImageError::TooManyTiles);
         }
         Ok(self.stitcher.offer(core, digest, replace)?)
-    }
-
-    pub(super) fn record(&self, digest: Digest, checksum: Checksum, filtered: &Filtered, seconds: f64) -> Change {
-        let record = TileRecord { digest, checksum, seconds, report: filtered.report.clone() };
-        let record = self.channels.as_ref().map_or_else(Vec::new, |channels| record.encode(channels));
-        Change::Put(Records::Tiles, filtered.core, record)
     }
 
     pub(super) fn committed(&mut self, after: After) {
@@ -58,11 +52,6 @@ impl Inner {
     /// Time that filtering a stored tile took.
     pub fn seconds(&self, core: &Rect) -> f64 {
         self.notes.get(core).map_or(0.0, |note| note.seconds)
-    }
-
-    /// The channels of its tiles: as announced, or those of the first that came whole.
-    pub const fn channels(&self) -> Option<&ChannelSet> {
-        self.channels.as_ref()
     }
 
     /// Whether it takes no more tiles.

@@ -65,7 +65,8 @@ pub(super) fn unfiltered(neighbors: &Neighbors, stitcher: &Stitcher, region: u32
 
 impl Image {
     /// The next region that can be filtered, in tiles that take at most `most` bytes, and have at most so many pixels,
-    /// each; but those that are filtered again are what they were.
+    /// each; but those that are filtered again are what they were. After [`ImageError::TooLarge`] there may be others: a
+    /// region of which not even a pixel fits, or such a tile, is set aside until it is [tried again](Self::retry).
     pub fn next_job(&self, threads: usize, most: u64, pixels: u64) -> Result<Option<Job>, ImageError> {
         self.check()?;
         let mut inner = self.write();
@@ -103,7 +104,7 @@ impl Image {
                 } else if !whole {
                     rects.extend(halves(core).map(|half| (half, false)));
                 } else {
-                    neighbors.give_back(region);
+                    neighbors.set_aside(region);
                     return Err(ImageError::TooLarge { core, needed: bytes, most });
                 }
             }
@@ -139,6 +140,13 @@ impl Image {
         self.flush()?;
         spent.write += began.elapsed();
         Ok(spent)
+    }
+
+    /// Regions that were set aside are among the next.
+    pub fn retry(&self) {
+        if let Some(neighbors) = &mut self.write().neighbors {
+            neighbors.retry();
+        }
     }
 
     /// A region that will not be filtered now.

@@ -13,6 +13,7 @@
 mod announced;
 pub mod description;
 mod error;
+mod index;
 mod inner;
 mod jobs;
 mod neighbors;
@@ -22,11 +23,13 @@ pub mod regions;
 pub use announced::keeping;
 pub use description::{Announced, Description, disk_bytes};
 pub use error::ImageError;
+pub use index::INDEX_STEP;
 pub use jobs::{Job, Spent};
 pub use regions::{RegionState, Regions};
 
 use std::{
     collections::HashMap,
+    convert::Infallible,
     fs::File,
     io,
     path::Path,
@@ -40,8 +43,8 @@ use crate::{
     disk::Folder,
     filter::{ChannelSet, Filtered, Rect, SampleTile, Stopped},
     stitch::{
-        Added, Canvas, CanvasError, Claim, ExrOptions, Offer, Pixels, StitchError, Stitcher, Verdict, canvas::Checksum,
-        digest::digest,
+        Added, Canvas, CanvasError, Claim, Digest, ExrOptions, Offer, Pixels, StitchError, Stitcher, Verdict,
+        canvas::Checksum, digest::digest,
     },
     store::{Change, Records, State, StateError, samples, state},
 };
@@ -106,6 +109,9 @@ pub struct Image {
     /// Taken before `inner`, if both are.
     committer: Mutex<Committer>,
     inner: RwLock<Inner>,
+    /// The channels of its tiles: as announced, or those of the first that came whole. Set while `inner` is held, and
+    /// read by who must not wait for the disk, as who holds that may.
+    channels: OnceLock<ChannelSet>,
     failed: OnceLock<StateError>,
     /// Held, many at a time, by those who write pixels or samples; taken before the other locks.
     writing: RwLock<()>,
@@ -124,7 +130,6 @@ struct Committer {
 pub struct Inner {
     stitcher: Stitcher,
     notes: HashMap<Rect, Note>,
-    channels: Option<ChannelSet>,
     neighbors: Option<Neighbors>,
     finished: bool,
     /// What is to be committed, and what to do then.
@@ -161,9 +166,19 @@ impl Image {
 
     /// Opens an image that is in a folder, as it was when it was last heard of. What was not committed is given up.
     pub fn open(folder: Box<dyn Folder>) -> Result<Self, ImageError> {
+        Ok(Self::open_within(folder, |_| Ok::<_, Infallible>(()))?.unwrap_or_else(|never| match never {}))
+    }
+
+    /// As [`Self::open`], if so many bytes of memory may be taken.
+    pub fn open_within<E>(
+        folder: Box<dyn Folder>,
+        admit: impl FnOnce(u64) -> Result<(), E>,
+    ) -> Result<Result<Self, E>, ImageError> {
         let state = State::open(&*folder)?;
-        let description = state.fact("image")?.and_then(|bytes| Description::decode(&bytes));
-        let description = description.ok_or_else(|| state.damaged("it does not say how the image was opened"))?;
+        let description = index::described(&state)?;
+        if let Err(refused) = admit(index::stored_bytes(&state, &description)?) {
+            return Ok(Err(refused));
+        }
         let [width, height] = description.size;
         let canvas = Canvas::open(width, height, &*folder, CANVAS)?;
         if let Some(bytes) = state.fact(REPLACEMENT)? {
@@ -209,7 +224,6 @@ impl Image {
         let inner = Inner {
             stitcher,
             notes,
-            channels,
             neighbors,
             finished,
             changes: Vec::new(),
@@ -218,20 +232,26 @@ impl Image {
             replacements: 0,
             result: None,
         };
-        Ok(Self {
+        Ok(Ok(Self {
             folder,
             description,
             canvas,
             committer: Mutex::new(Committer { state: Some(state), done: 0 }),
             inner: RwLock::new(inner),
+            channels: channels.map_or_else(OnceLock::new, OnceLock::from),
             failed: OnceLock::new(),
             writing: RwLock::new(()),
-        })
+        }))
     }
 
     /// How it was opened.
     pub const fn description(&self) -> &Description {
         &self.description
+    }
+
+    /// The channels of its tiles: as announced, or those of the first that came whole. Waits for nobody.
+    pub fn channels(&self) -> Option<&ChannelSet> {
+        self.channels.get()
     }
 
     /// Where its files are.
@@ -277,14 +297,14 @@ impl Image {
             return self.keep(tile, digest);
         }
         let mut inner = self.write();
-        match &inner.channels {
+        match self.channels() {
             // Of two first tiles at once, one may have been quicker.
             Some(known) if known != tile.channels() => return Err(ImageError::Channels),
             Some(_) => {}
             None => {
                 let channels = channels_to_json(tile.channels()).to_string().into_bytes();
                 inner.queue([Change::Fact("channels", channels)], None);
-                inner.channels = Some(tile.channels().clone());
+                let _ = self.channels.set(tile.channels().clone());
             }
         }
         match inner.offer(tile.geometry().core(), digest, replace)? {
@@ -321,7 +341,7 @@ impl Image {
         beside.sync()?;
         self.folder.sync()?;
         let place = [core.x, core.y, core.width, core.height].iter().flat_map(|n| n.to_le_bytes()).collect();
-        let record = inner.record(claim.digest(), checksum, filtered, seconds);
+        let record = self.record(claim.digest(), checksum, filtered, seconds);
         self.commit_now(&mut committer, &[record, Change::Fact(REPLACEMENT, place)])?;
         // From here on it is stored, and a new start would do what follows.
         inner.forget_result(&*self.folder);
@@ -349,11 +369,17 @@ impl Image {
             Ok(())
         })?;
         if added == Added::Stored {
-            let record = inner.record(digest, checksum, filtered, seconds);
+            let record = self.record(digest, checksum, filtered, seconds);
             inner.notes.insert(core, Note { seconds, checksum });
             inner.queue([record], None);
         }
         Ok(added)
+    }
+
+    fn record(&self, digest: Digest, checksum: Checksum, filtered: &Filtered, seconds: f64) -> Change {
+        let record = TileRecord { digest, checksum, seconds, report: filtered.report.clone() };
+        let record = self.channels().map_or_else(Vec::new, |channels| record.encode(channels));
+        Change::Put(Records::Tiles, filtered.core, record)
     }
 
     /// Takes no more tiles; what waits for tiles is filtered with what there is. Durable when it returns.

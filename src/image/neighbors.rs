@@ -188,6 +188,11 @@ impl Neighbors {
         &self.regions
     }
 
+    /// Cores and parts of halos that are known.
+    pub(super) fn entries(&self) -> usize {
+        self.cores.len() + self.lent.len()
+    }
+
     pub(super) fn count(&self) -> (usize, u64) {
         (self.cores.len(), self.pixels)
     }
@@ -255,6 +260,14 @@ impl Neighbors {
 
     pub(super) fn give_back(&mut self, region: u32) {
         self.regions.give_back(region);
+    }
+
+    pub(super) fn set_aside(&mut self, region: u32) {
+        self.regions.set_aside(region);
+    }
+
+    pub(super) fn retry(&mut self) {
+        self.regions.retry();
     }
 
     /// A tile of a region that is provisional.

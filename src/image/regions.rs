@@ -18,6 +18,8 @@ pub enum RegionState {
     Ready,
     /// It is being filtered.
     Running,
+    /// It can be filtered, but not within the memory that there is.
+    TooLarge,
     /// It is filtered with lent pixels, and waits for their cores.
     Filtered,
     /// It is filtered for good.
@@ -33,6 +35,7 @@ pub struct Regions {
     columns: u32,
     all: Vec<Region>,
     ready: BTreeSet<u32>,
+    aside: Vec<u32>,
     open: usize,
     /// Nothing more will arrive.
     finished: bool,
@@ -52,8 +55,8 @@ impl Regions {
     pub fn new([width, height]: [u32; 2], size: u32, reach: u32) -> Self {
         let (image, columns) = (Rect::new(0, 0, width, height), width.div_ceil(size));
         let count = (columns * height.div_ceil(size)) as usize;
-        let (all, ready) = (Vec::with_capacity(count), BTreeSet::new());
-        let mut regions = Self { image, size, reach, columns, all, ready, open: count, finished: false };
+        let (all, ready, aside) = (Vec::with_capacity(count), BTreeSet::new(), Vec::new());
+        let mut regions = Self { image, size, reach, columns, all, ready, aside, open: count, finished: false };
         for index in 0..count as u32 {
             let pixels = regions.window(index).area();
             regions.all.push(Region { coreless: pixels, lacking: pixels, state: RegionState::Waiting });
@@ -146,6 +149,20 @@ impl Regions {
     /// A region that was running is not, and can be filtered again.
     pub fn give_back(&mut self, index: u32) {
         if self.state(index) == RegionState::Running {
+            self.all[index as usize].state = RegionState::Ready;
+            self.ready.insert(index);
+        }
+    }
+
+    /// A region that was running cannot be filtered for now, and keeps no others waiting.
+    pub fn set_aside(&mut self, index: u32) {
+        self.all[index as usize].state = RegionState::TooLarge;
+        self.aside.push(index);
+    }
+
+    /// Those that were set aside can be filtered again.
+    pub fn retry(&mut self) {
+        for index in std::mem::take(&mut self.aside) {
             self.all[index as usize].state = RegionState::Ready;
             self.ready.insert(index);
         }
@@ -299,6 +316,13 @@ mod tests {
         regions.give_back(0);
         regions.done(1);
         regions.give_back(1);
+        assert_eq!((regions.start_next(), regions.start_next(), regions.open()), (Some(0), None, 1));
+        // What is set aside is not ready until it is tried again, and open all the while.
+        regions.set_aside(0);
+        regions.finish();
+        assert_eq!((regions.start_next(), regions.ready(), regions.open()), (None, 0, 1));
+        regions.retry();
+        regions.retry();
         assert_eq!((regions.start_next(), regions.start_next(), regions.open()), (Some(0), None, 1));
     }
 }

@@ -1,7 +1,7 @@
 //! What a request takes beside its tiles: the buffers of its connection and of its answer, and the window of a
 //! decompressor. A share of the memory is set aside for this, so that tiles and requests never wait for each other in a
 //! circle: who holds memory for a tile takes from this share only what is free, and who waits for a wide window holds
-//! nothing.
+//! nothing. Who waits for the counts of a tile holds a request, and so there is a part of the share for these alone.
 
 use std::{
     pin::Pin,
@@ -31,10 +31,13 @@ pub(super) const REQUEST: u64 = 256 << 10;
 /// The window that is taken from the start for a body in zstd: that of its default level.
 const WINDOW: u64 = 2 << 20;
 
-/// Memory that is set aside for requests, of so much in all: a quarter up to 64 MiB, then an eighth.
-pub(super) const fn share(memory: u64) -> u64 {
-    let quarter = if memory / 4 < 64 << 20 { memory / 4 } else { 64 << 20 };
-    if memory / 8 > quarter { memory / 8 } else { quarter }
+/// What of so much memory is for tiles, for requests, for the counts of tiles that vary in them, and for what is known of
+/// images. Requests have a quarter up to 64 MiB, then an eighth; of that, a quarter is for counts. Images have half of
+/// what requests and counts have.
+pub(super) fn shares(memory: u64) -> [u64; 4] {
+    let share = (memory / 4).min(64 << 20).max(memory / 8);
+    let (counts, images) = (share / 4, share / 2);
+    [memory - share - images, share - counts, counts, images]
 }
 
 /// The permit of a request: it lasts until request and answer are both done with.
@@ -62,7 +65,18 @@ impl Charge {
         self.permit().grow_to(REQUEST + OVERHEAD + window).map_err(for_window)
     }
 
-    /// The same at the start of a body, when nothing else is held: waits for its turn, and until then gives back what it
+    /// Takes so many bytes more, for an answer that needs them; if they are not there it does not wait for them.
+    pub(super) fn add(&self, bytes: u64) -> Result<(), Refusal> {
+        let mut permit = self.permit();
+        let all = permit.bytes() + bytes;
+        permit.grow_to(all).map_err(|error| {
+            let mut refusal = Refusal::from(error);
+            refusal.0.title = "The request needs more memory than there is for it".to_owned();
+            refusal
+        })
+    }
+
+    /// As [`Self::add_window`] at the start of a body, when nothing else is held: waits for its turn, and until then gives back what it
     /// has.
     pub(super) async fn wait_window(&self, window: u64) -> Result<(), Refusal> {
         let bytes = REQUEST + OVERHEAD + window;

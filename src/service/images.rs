@@ -5,7 +5,7 @@ use std::{
     fs::File,
     io::{self, Write},
     sync::{
-        Arc, PoisonError,
+        Arc,
         atomic::{AtomicBool, Ordering},
     },
 };
@@ -44,8 +44,14 @@ use crate::{
 
 /// Most bytes of the JSON that opens an image.
 const MAX_JSON: usize = 64 << 10;
+/// Bytes of memory that each byte of it takes at most: an object of nothing has a list of eleven places.
+const JSON_GROWS: u64 = 128;
 /// Most missing regions that a problem lists; it says how many there are.
 const MAX_LISTED: usize = 1000;
+/// Bytes of memory that looking for what is missing takes for each tile, at most.
+const LOOKING: u64 = 192;
+/// Bytes of memory that the summary of an image takes at most.
+const SUMMARY: u64 = 8 << 10;
 /// Of what a region waits for, this much is listed.
 const MAX_WAITED: usize = 16;
 
@@ -83,6 +89,12 @@ pub(super) fn summary(id: &Id, image: &Image) -> Value {
 }
 
 impl Opened {
+    /// Takes memory for looking at all tiles.
+    fn charge(&self, charge: &Charge) -> Result<(), Refusal> {
+        let inner = self.image.read();
+        charge.add(LOOKING * (inner.stitcher().known() + inner.arrived().0) as u64)
+    }
+
     fn summary(&self, service: &Shared) -> Value {
         let mut summary = summary(&self.entry.id, &self.image);
         summary["expires"] = service.images.expires(&self.entry).into();
@@ -94,7 +106,6 @@ impl Opened {
         let mut status = self.summary(service);
         let (description, inner) = (self.image.description(), self.image.read());
         let stitcher = inner.stitcher();
-        status["missing"] = stitcher.missing().into_iter().map(|rect| json!(corners(rect))).collect();
         let totals = stitcher.totals();
         let (mut replaced, needed) = (totals.replaced, totals.halo_needed);
         if inner.regions().is_some() {
@@ -130,13 +141,17 @@ impl Opened {
             .map(|((plane, reason), tiles)| json!({ "plane": plane, "reason": reason, "tiles": tiles }))
             .collect();
         if inner.regions().is_some() {
-            let trouble = self.entry.runner.trouble.lock().unwrap_or_else(PoisonError::into_inner);
-            status["trouble"] = json!(*trouble);
+            status["trouble"] = json!(self.entry.runner.told());
         }
         // The object, but for its last brace.
         let mut head = status.to_string();
         head.pop();
-        write!(out, "{head},\"tiles\":[")?;
+        write!(out, "{head},\"missing\":[")?;
+        for (i, rect) in stitcher.missing().into_iter().enumerate() {
+            let comma = if i == 0 { "" } else { "," };
+            write!(out, "{comma}{}", json!(corners(rect)))?;
+        }
+        write!(out, "],\"tiles\":[")?;
         for (i, (core, report, seconds)) in tiles().enumerate() {
             let mut report = json!(TileReport::new(report, &description.method, description.seed, seconds));
             // The same for all tiles, or told of all of them together, above.
@@ -155,6 +170,7 @@ impl Opened {
                     RegionState::Waiting => "waiting",
                     RegionState::Ready | RegionState::Done => "ready",
                     RegionState::Running => "running",
+                    RegionState::TooLarge => "too_large",
                     RegionState::Filtered => "filtered",
                 };
                 let mut region = json!({ "region": corners(regions.core(index)), "state": state });
@@ -183,7 +199,12 @@ impl Opened {
             let (snapshot, settled, replacements) = {
                 let inner = self.image.read();
                 let settled = inner.settled();
-                check_complete(&inner, partial || settled && inner.finished())?;
+                check_complete(&inner, partial || settled && inner.finished()).map_err(|mut refusal| {
+                    if let Some(trouble) = self.entry.runner.told() {
+                        refusal.0.more.insert("trouble".to_owned(), json!(trouble));
+                    }
+                    refusal
+                })?;
                 let (pixels, missing) = (inner.stitcher().pixels(), inner.stitcher().check_complete(true)?);
                 (Snapshot { pixels, missing, stop }, settled, inner.replacements())
             };
@@ -339,7 +360,8 @@ pub(super) async fn open(State(service): State<Shared>, charge: Charge, request:
     Parameters::of_query(request.uri())?.done("none: an image is described in the body")?;
     let (parts, body) = request.into_parts();
     let owner = parts.extensions.get::<Owner>().cloned();
-    let body = Frames::new(&parts.headers, body, charge, service.pace())?.all(MAX_JSON).await?;
+    let body = Frames::new(&parts.headers, body, charge.clone(), service.pace())?.all(MAX_JSON).await?;
+    charge.add(JSON_GROWS * body.len() as u64)?;
     let (status, id, summary) = blocking(move || {
         let (id, mut description) = described(&body, &service)?;
         description.owner = owner.as_ref().map(|owner| owner.name.to_string());
@@ -355,16 +377,25 @@ pub(super) async fn open(State(service): State<Shared>, charge: Charge, request:
 }
 
 /// `GET /v1/images`.
-pub(super) async fn list(State(service): State<Shared>, _: NoQuery) -> Result<Json<Value>, Refusal> {
+pub(super) async fn list(State(service): State<Shared>, charge: Charge, _: NoQuery) -> Result<Json<Value>, Refusal> {
+    charge.add(SUMMARY * service.images.count() as u64)?;
     let list = blocking(move || service.images.list()).await?;
     Ok(Json(json!({ "images": list })))
 }
 
 /// `GET /v1/images/{id}`.
-pub(super) async fn status(State(service): State<Shared>, id: Id, _: NoQuery) -> Result<Response, Refusal> {
+pub(super) async fn status(
+    State(service): State<Shared>,
+    id: Id,
+    charge: Charge,
+    _: NoQuery,
+) -> Result<Response, Refusal> {
     let file = blocking(move || {
         let opened = service.images.find(&id)?;
+        opened.charge(&charge)?;
         opened.image.flush()?;
+        // It may have been out of memory since the service was started.
+        regions::kick(&service, &opened);
         write_file(&service.config.data_dir, service.unread.none(), |out| Ok(opened.write_status(&service, out)?))
     });
     Ok(file_response(file.await??, "application/json").await?)
@@ -397,7 +428,12 @@ pub(super) async fn finish(State(service): State<Shared>, id: Id, _: NoQuery) ->
 }
 
 /// `GET /v1/images/{id}/result.exr`.
-pub(super) async fn result(State(service): State<Shared>, id: Id, request: Request) -> Result<Response, Refusal> {
+pub(super) async fn result(
+    State(service): State<Shared>,
+    id: Id,
+    charge: Charge,
+    request: Request,
+) -> Result<Response, Refusal> {
     let images = Arc::clone(&service);
     let opened = blocking(move || images.images.find(&id)).await??;
     let mut parameters = Parameters::of_query(request.uri())?;
@@ -409,12 +445,21 @@ pub(super) async fn result(State(service): State<Shared>, id: Id, request: Reque
     let entry = Arc::clone(&opened.entry);
     let _turn = entry.encoding.lock().await;
     let shared = Arc::clone(&service);
-    let file = service.work.picture(move |stop| opened.exr(&shared, &options, partial, stop)).await?;
+    let file = service.work.picture(move |stop| {
+        opened.charge(&charge)?;
+        opened.exr(&shared, &options, partial, stop)
+    });
+    let file = file.await?;
     Ok(file_response(file, Form::Exr.media()).await?)
 }
 
 /// `GET /v1/images/{id}/preview.png`.
-pub(super) async fn preview(State(service): State<Shared>, id: Id, request: Request) -> Result<Response, Refusal> {
+pub(super) async fn preview(
+    State(service): State<Shared>,
+    id: Id,
+    charge: Charge,
+    request: Request,
+) -> Result<Response, Refusal> {
     let images = Arc::clone(&service);
     let opened = blocking(move || images.images.find(&id)).await??;
     let mut parameters = Parameters::of_query(request.uri())?;
@@ -422,6 +467,7 @@ pub(super) async fn preview(State(service): State<Shared>, id: Id, request: Requ
     parameters.done("partial")?;
     let shared = Arc::clone(&service);
     let file = service.work.picture(move |stop| {
+        opened.charge(&charge)?;
         opened.image.flush()?;
         opened.consistent(partial, stop, |snapshot, _, _| {
             let (folder, permit) = (&shared.config.data_dir, shared.unread.none());

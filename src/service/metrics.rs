@@ -209,8 +209,8 @@ impl Metrics {
         own.register("images_open", "Images that are open", all.images.clone());
         own.register("images_in_memory", "Those of them that are in memory", all.images_in_memory.clone());
         for (name, help, gauge) in [
-            ("memory_used", "Memory reserved for tiles and requests", &all.memory_used),
-            ("memory_limit", "Memory that tiles and requests may have", &all.memory_limit),
+            ("memory_used", "Memory reserved for tiles, requests and images", &all.memory_used),
+            ("memory_limit", "Memory that tiles, requests and images may have", &all.memory_limit),
             ("unread_results", "Disk reserved for results that nobody has read yet", &all.unread_used),
             ("unread_results_limit", "Disk that such results may have", &all.unread_limit),
             ("images_disk", "Disk set aside for images", &all.images_used),
@@ -285,10 +285,10 @@ impl Metrics {
     /// All of it as text. Blocks.
     fn render(&self, service: &Shared) -> Result<String, Refusal> {
         let bytes = |bytes: u64| i64::try_from(bytes).unwrap_or(i64::MAX);
-        let (tiles, requests, unread) = (&service.budget, &service.requests, &service.unread);
-        let used = |budget: &Budget| budget.total() - budget.free();
-        self.memory_limit.set(bytes(tiles.total() + requests.total()));
-        self.memory_used.set(bytes(used(tiles) + used(requests)));
+        let memory = [&service.budget, &service.requests, &service.counts, &service.images.memory];
+        let (used, unread) = (|budget: &Budget| budget.total() - budget.free(), &service.unread);
+        self.memory_limit.set(bytes(memory.map(Budget::total).into_iter().sum()));
+        self.memory_used.set(bytes(memory.map(used).into_iter().sum()));
         self.unread_limit.set(bytes(unread.total()));
         self.unread_used.set(bytes(used(unread)));
         self.images.set(bytes(service.images.count() as u64));

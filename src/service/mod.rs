@@ -14,6 +14,7 @@ mod connection;
 mod health;
 mod images;
 mod inflate;
+mod known;
 mod metrics;
 mod openapi;
 mod opened;
@@ -122,6 +123,9 @@ struct Inner {
     spare: Spare,
     /// Memory for requests.
     requests: Budget,
+    /// Memory for the counts of tiles whose pixels differ in them, while these come: of its own, since who waits for it
+    /// holds some of that for requests.
+    counts: Budget,
     /// Disk for results that nobody has read yet.
     unread: Budget,
     work: Work,
@@ -193,17 +197,29 @@ impl Service {
         let work = Work::new(config.threads, config.work_deadline)?;
         let (listener, address) = listen(config.listen)?;
         let metrics = config.metrics_listen.map(listen).transpose()?;
-        let share = charge::share(config.memory.0);
-        let [budget, requests, unread] =
-            [config.memory.0 - share, share, config.unread_results.0].map(|bytes| Budget::new(bytes, config.queue));
-        let (images, found) = Images::start(&config).map_err(|error| match error {
+        let of = |bytes| Budget::new(bytes, config.queue);
+        let ([budget, requests, counts, memory], unread) =
+            (charge::shares(config.memory.0).map(of), of(config.unread_results.0));
+        let (images, found) = Images::start(&config, memory).map_err(|error| match error {
             StartError::InUse => ServeError::InUse { path: config.data_dir.clone() },
             StartError::Io(source) => data_dir(source),
         })?;
-        let (counts, readiness) = (Metrics::new(), Readiness::default());
+        let readiness = Readiness::default();
         readiness.set(Reason::Recovering, !found.is_empty());
         let spare = Spare::new(budget.clone());
-        let inner = Inner { config, budget, spare, requests, unread, work, images, auth, metrics: counts, readiness };
+        let inner = Inner {
+            config,
+            budget,
+            spare,
+            requests,
+            counts,
+            unread,
+            work,
+            images,
+            auth,
+            metrics: Metrics::new(),
+            readiness,
+        };
         Ok(Self { listener, address, metrics, found, inner: Arc::new(inner) })
     }
 

@@ -24,7 +24,7 @@ impl Opened {
         self.image.description().neighbors.is_some()
     }
 
-    /// Refuses tiles of other images.
+    /// Refuses tiles of other images. Waits for nobody.
     pub(super) fn check(&self, header: &Header) -> Result<(), Refusal> {
         let refuse = |code, detail| {
             let title = "The tile is not of this image";
@@ -38,8 +38,7 @@ impl Opened {
             );
             return refuse("image_mismatch", detail);
         }
-        let inner = self.image.read();
-        if let Some(known) = inner.channels()
+        if let Some(known) = self.image.channels()
             && known != header.channels()
         {
             let names = |set: &ChannelSet| set.channels().iter().map(|c| c.name.clone()).collect::<Vec<_>>().join(", ");
@@ -56,7 +55,8 @@ impl Opened {
     }
 
     /// Asks whether a tile is wanted. Blocks.
-    pub(super) fn offer(&self, tile: &SampleTile, replace: bool) -> Result<Outcome, Refusal> {
+    pub(super) fn offer(&self, tile: &SampleTile, replace: bool, service: &Shared) -> Result<Outcome, Refusal> {
+        service.images.make_room(self)?;
         Ok(self.image.offer(tile, replace)?)
     }
 
@@ -78,5 +78,61 @@ impl Opened {
         self.image.flush()?;
         regions::kick(service, self);
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        admission::Budget,
+        disk::Directory,
+        filter::{Channel, Method, Rect, Role, TileGeometry},
+        image::{Description, Image},
+        service::{
+            known::Memory,
+            registry::{Entry, Id, Slot},
+        },
+        wire::{Format, SampleCounts},
+    };
+    use std::{sync::mpsc, thread, time::Duration};
+
+    /// Who is at work on an image, with the disk too, keeps no thread that serves connections.
+    #[test]
+    fn a_header_is_judged_while_others_hold_the_image() {
+        let folder = tempfile::tempdir().unwrap();
+        let description = Description {
+            size: [64, 64],
+            method: Method::default(),
+            seed: 0,
+            leave_out: true,
+            neighbors: None,
+            owner: None,
+            disk: 0,
+        };
+        Image::create(&Directory::new(folder.path()), &description).unwrap();
+        let image = Arc::new(Image::open(Box::new(Directory::new(folder.path()))).unwrap());
+        let entry = Arc::new(Entry::new(Id::new(), None, 0, 0, Slot::Gone));
+        let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+        let geometry = TileGeometry::with_halo([64, 64], Rect::new(0, 0, 16, 16), 0).unwrap();
+        let header = Header::new(geometry, channels, SampleCounts::Uniform(1), Format::F32).unwrap();
+        let memory = Memory::new(Budget::new(0, 0).none());
+        let opened = Opened { entry, image: Arc::clone(&image), memory };
+        thread::scope(|scope| {
+            let held = image.read();
+            // It waits to change the image, and everybody who wants to look at it waits behind it.
+            scope.spawn(|| image.finish().unwrap());
+            let (done, seen) = mpsc::channel();
+            thread::spawn(move || {
+                for _ in 0..100 {
+                    opened.check(&header).unwrap();
+                    thread::sleep(Duration::from_millis(2));
+                }
+                done.send(()).unwrap();
+            });
+            let seen = seen.recv_timeout(Duration::from_secs(60));
+            drop(held);
+            seen.expect("it waits");
+        });
     }
 }

@@ -187,8 +187,13 @@ async fn announce(call: &Call, header: Header) -> Result<Open, Fault> {
     let (geometry, service) = (*header.geometry(), &call.service);
     let tile = |refusal| Fault::Tile(geometry.core(), refusal);
     call.check(&header).map_err(tile)?;
-    if !header.varying() {
-        // What never fits is said at once.
+    // What never fits is said at once.
+    let (left, even) = (geometry.window().area(), header.total().div_ceil(geometry.window().area()));
+    if header.varying() {
+        let shape = Shape { max_per_pixel: even as u32, ..header.shape() };
+        let fits = service.counts.check(count_bytes(left));
+        fits.map_err(|error| tile(too_large(error, &header, &shape, call)))?;
+    } else {
         fits(call, &header, header.max_per_pixel()).map_err(tile)?;
     }
     let deadline = service.config.queue_deadline;
@@ -203,8 +208,7 @@ async fn announce(call: &Call, header: Header) -> Result<Open, Fault> {
     if !header.varying() {
         return admit(call, assembler, unread, header.max_per_pixel()).await;
     }
-    let left = geometry.window().area();
-    let held = service.requests.reserve(count_bytes(left), deadline).await.map_err(|error| tile(error.into()))?;
+    let held = service.counts.reserve(count_bytes(left), deadline).await.map_err(|error| tile(error.into()))?;
     let (counts, most) = (CountReader::default(), 0);
     Ok(Open::Counting(Counting { assembler, unread, counts, most, left, _held: held }))
 }
@@ -271,7 +275,7 @@ fn largest_core(header: &Header, shape: &Shape, call: &Call) -> Option<u32> {
             let shape = Shape { geometry: &geometry, samples, ..*shape };
             let counts = if shape.varying { count_bytes(geometry.window().area()) } else { 0 };
             service.budget.check(call.plan(&shape).total(service.config.threads)).is_ok()
-                && service.requests.check(counts).is_ok()
+                && service.counts.check(counts).is_ok()
         })
     };
     // The need grows with the side.

@@ -78,12 +78,18 @@ impl Images {
         let touched =
             touched.ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok()).map_or_else(now, |t| t.as_secs());
         let opened = tidy(path).map_err(image::ImageError::from);
-        let (owner, disk, slot) = match opened.and_then(|()| Image::open(Box::new(Directory::new(path)))) {
-            Ok(image) => {
+        let (owner, disk, slot) = match opened.and_then(|()| self.read(path)) {
+            Ok(Err(error)) => {
+                tracing::warn!(id = id.0, %error, "an image waits on the disk until somebody asks for it");
+                let known = Image::describe(&Directory::new(path)).map(|known| (known.owner, known.disk));
+                let (owner, disk) = known.unwrap_or_else(|_| (None, used(path)));
+                (owner, disk, Slot::Closed(Value::Null))
+            }
+            Ok(Ok((image, memory))) => {
                 let (description, summary) = (image.description().clone(), super::images::summary(&id, &image));
                 // What can go on is kept open.
                 let waits = image.read().regions().is_some_and(|regions| regions.open() > 0);
-                let slot = if waits { Slot::Open(Arc::new(image)) } else { Slot::Closed(summary) };
+                let slot = if waits { Slot::Open(image, memory) } else { Slot::Closed(summary) };
                 (description.owner, description.disk, slot)
             }
             Err(error) => {
@@ -93,10 +99,10 @@ impl Images {
                 (None, used(path), slot)
             }
         };
-        let image = if let Slot::Open(image) = &slot { Some(Arc::clone(image)) } else { None };
+        let open = if let Slot::Open(image, memory) = &slot { Some((Arc::clone(image), memory.clone())) } else { None };
         let entry = Arc::new(Entry::new(id.clone(), owner, disk, touched, slot));
         self.lock().insert(id, Arc::clone(&entry));
-        image.map(|image| Opened { entry, image })
+        open.map(|(image, memory)| Opened { entry, image, memory })
     }
 
     /// Keeps the id of an image that could not even be looked at, so that nobody opens another one in its place.

@@ -35,7 +35,7 @@ pub(super) struct Runner {
     /// There may be something to filter.
     pub(super) wake: Notify,
     /// Why it cannot go on at the moment.
-    pub(super) trouble: Mutex<Option<Box<Problem>>>,
+    trouble: Mutex<Option<Box<Problem>>>,
     /// Stops the work on the image: it is forgotten, or the service ends.
     pub(super) stop: CancellationToken,
     /// Pixels that a part of a region may have: fewer after one that took too long.
@@ -61,9 +61,9 @@ impl Runner {
         self.pixels.fetch_min(job.pixels / 2, Ordering::Relaxed);
     }
 
-    /// Whether nothing keeps it from going on.
-    pub(super) fn untroubled(&self) -> bool {
-        self.trouble.lock().unwrap_or_else(PoisonError::into_inner).is_none()
+    /// What keeps it from going on, if anything.
+    pub(super) fn told(&self) -> Option<Box<Problem>> {
+        self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     fn trouble(&self, problem: Option<Box<Problem>>) {
@@ -85,7 +85,7 @@ pub(super) fn kick(service: &Shared, opened: &Opened) {
 
 /// Filters until nothing is left that can be.
 async fn run(service: Shared, mut opened: Opened) {
-    let mut pause = PAUSES[0];
+    let (mut pause, mut woken) = (PAUSES[0], false);
     loop {
         match drain(&service, &opened).await {
             Ok(()) => opened.entry.runner.trouble(None),
@@ -94,16 +94,29 @@ async fn run(service: Shared, mut opened: Opened) {
                 let (id, late) = (&opened.entry.id.0, refusal.0.code == "work_timeout");
                 // What took too long is different the next time.
                 pause = if late { PAUSES[0] } else { pause };
-                tracing::warn!(id, problem = refusal.0.detail, seconds = pause.as_secs(), "regions wait");
-                opened.entry.runner.trouble(Some(refusal.0));
-                let stop = opened.entry.runner.stop.clone();
-                if stop.run_until_cancelled(sleep(pause)).await.is_none() {
-                    break;
+                if !woken {
+                    tracing::warn!(id, problem = refusal.0.detail, seconds = pause.as_secs(), "regions wait");
                 }
-                pause = (pause * 2).min(PAUSES[1]);
+                // What is too large keeps nothing else waiting.
+                let aside = refusal.0.code == "over_memory";
+                let runner = &opened.entry.runner;
+                runner.trouble(Some(refusal.0));
+                tokio::select! {
+                    () = runner.stop.cancelled() => break,
+                    () = runner.wake.notified(), if aside => woken = true,
+                    () = sleep(pause) => {
+                        pause = (pause * 2).min(PAUSES[1]);
+                        woken = false;
+                    }
+                }
                 // An image that has failed is opened anew.
                 let (images, id) = (Arc::clone(&service), opened.entry.id.clone());
-                match blocking(move || images.images.again(&id)).await.flatten() {
+                let again = blocking(move || {
+                    let again = images.images.again(&id)?;
+                    again.iter().for_each(|again| again.image.retry());
+                    Ok(again)
+                });
+                match again.await.flatten() {
                     Ok(Some(again)) if Arc::ptr_eq(&again.entry, &opened.entry) => opened = again,
                     Ok(_) => break,
                     // It stays as it is, and fails again.
@@ -115,18 +128,20 @@ async fn run(service: Shared, mut opened: Opened) {
         let runner = &opened.entry.runner;
         runner.running.store(false, Ordering::SeqCst);
         // What came after the last look and before this was not seen by anybody.
-        let more = opened.image.read().regions().is_some_and(|regions| regions.ready() > 0);
-        if !more || runner.running.swap(true, Ordering::SeqCst) {
+        let image = Arc::clone(&opened.image);
+        let more = blocking(move || image.read().regions().is_some_and(|regions| regions.ready() > 0));
+        if !more.await.unwrap_or(false) || runner.running.swap(true, Ordering::SeqCst) {
             return;
         }
     }
     opened.entry.runner.running.store(false, Ordering::SeqCst);
 }
 
-/// Filters regions, a few at a time, until none is ready and none is being filtered, or one fails.
+/// Filters regions, a few at a time, until none is ready and none is being filtered, or one fails. One that is too large
+/// is told of at the end.
 async fn drain(service: &Shared, opened: &Opened) -> Result<(), Refusal> {
     let mut jobs: JoinSet<Result<(), Refusal>> = JoinSet::new();
-    let mut failed = None;
+    let (mut failed, mut aside) = (None, None);
     loop {
         let next = match &failed {
             Some(_) => None,
@@ -136,6 +151,11 @@ async fn drain(service: &Shared, opened: &Opened) -> Result<(), Refusal> {
                 let next = blocking(move || next_job(&shared, &opened));
                 match next.await.and_then(|next| next.map_err(Refusal::from)) {
                     Ok(next) => next,
+                    Err(refusal) if refusal.0.code == "over_memory" => {
+                        service.metrics.region(&refusal.0.code);
+                        aside.get_or_insert(refusal);
+                        continue;
+                    }
                     Err(refusal) => {
                         failed = Some(refusal);
                         continue;
@@ -147,7 +167,7 @@ async fn drain(service: &Shared, opened: &Opened) -> Result<(), Refusal> {
             Some(job) => {
                 jobs.spawn(filter(Arc::clone(service), opened.clone(), job));
             }
-            None if jobs.is_empty() => return failed.map_or(Ok(()), Err),
+            None if jobs.is_empty() => return failed.or(aside).map_or(Ok(()), Err),
             None => {
                 tokio::select! {
                     Some(done) = jobs.join_next() => {
@@ -180,19 +200,26 @@ async fn filter(service: Shared, opened: Opened, job: Job) -> Result<(), Refusal
         () = runner.stop.cancelled() => Err(stopped()),
     };
     drop(waiting);
-    let permit = permit.inspect_err(|_| image.give_back(&job))?;
+    let permit = match permit {
+        Ok(permit) => permit,
+        Err(refusal) => {
+            blocking(move || image.give_back(&job)).await?;
+            return Err(refusal);
+        }
+    };
     service.spare.make_room();
     metrics.phase(Phase::Queue, asked);
-    let (shared, entry, ready) = (Arc::clone(&service), Arc::clone(&opened.entry), Instant::now());
+    let (shared, here, ready) = (Arc::clone(&service), opened.clone(), Instant::now());
     let work = service.work.run(move |pool, stop| {
         let _permit = permit;
         shared.metrics.phase(Phase::Turn, ready);
+        shared.images.make_room(&here).inspect_err(|_| image.give_back(&job))?;
         let simd = shared.config.simd;
         let execution = Execution { pool: Some(pool), stop: Some(stop), simd, ..Execution::default() };
         let done = image.run(&job, &execution);
         if let (Err(ImageError::Stopped(_)), false) = (&done, job.has_progress()) {
             // If it was not for the time, this image is not filtered any more.
-            entry.runner.too_long(&job);
+            here.entry.runner.too_long(&job);
         }
         Ok(done?)
     });

@@ -19,11 +19,16 @@ use axum::{
 };
 use serde_json::{Value, json};
 
-use super::{problem::Refusal, regions};
+use super::{
+    known::{Memory, no_memory},
+    problem::Refusal,
+    regions,
+};
 use crate::{
+    admission::Budget,
     config::Config,
     disk::Directory,
-    image::{self, Description, Image, ImageError},
+    image::{self, Description, INDEX_STEP, Image, ImageError},
     wire::Problem,
 };
 
@@ -94,7 +99,7 @@ pub(super) struct Entry {
 pub(super) enum Slot {
     /// On the disk only; its summary as it was last.
     Closed(Value),
-    Open(Arc<Image>),
+    Open(Arc<Image>, Memory),
     /// Its files are not what was written.
     Damaged(String),
     Gone,
@@ -103,7 +108,7 @@ pub(super) enum Slot {
 impl Slot {
     /// Whether a request, or the work on its regions, has it.
     fn is_used(&self) -> bool {
-        matches!(self, Self::Open(image) if Arc::strong_count(image) > 1)
+        matches!(self, Self::Open(image, _) if Arc::strong_count(image) > 1)
     }
 }
 
@@ -112,6 +117,7 @@ impl Slot {
 pub(super) struct Opened {
     pub(super) entry: Arc<Entry>,
     pub(super) image: Arc<Image>,
+    pub(super) memory: Memory,
 }
 
 impl Entry {
@@ -136,7 +142,7 @@ impl Entry {
 
     /// Whether somebody is at work on it, or reads its result. Who tries in vain is not at work.
     fn is_used(&self, slot: &Slot) -> bool {
-        self.is_read() || self.runner.untroubled() && slot.is_used()
+        self.is_read() || self.runner.told().is_none() && slot.is_used()
     }
 
     /// Whether somebody reads the result that the image keeps, or kept.
@@ -188,6 +194,8 @@ pub(super) struct Images {
     ttl: Duration,
     /// How long it stays in memory.
     idle: Duration,
+    /// Memory for what is known of those that are in memory.
+    pub(super) memory: Budget,
     /// Held as long as this lives.
     _lock: File,
 }
@@ -212,7 +220,7 @@ pub(super) fn now() -> u64 {
 
 impl Images {
     /// Takes the data folder, and says what is in it, which is to be [recovered](Self::recover).
-    pub(super) fn start(config: &Config) -> Result<(Self, Vec<PathBuf>), StartError> {
+    pub(super) fn start(config: &Config, memory: Budget) -> Result<(Self, Vec<PathBuf>), StartError> {
         let lock =
             File::options().read(true).write(true).create(true).truncate(false).open(config.data_dir.join(LOCK))?;
         match lock.try_lock() {
@@ -231,6 +239,7 @@ impl Images {
             leaving: Arc::default(),
             ttl: config.image_ttl,
             idle: config.image_idle,
+            memory,
             _lock: lock,
         };
         Ok((images, found))
@@ -248,7 +257,7 @@ impl Images {
     /// How many of them are in memory.
     pub(super) fn in_memory(&self) -> usize {
         // One that is just being opened is as good as open.
-        let open = |entry: &&Arc<Entry>| entry.slot.try_lock().map_or(true, |slot| matches!(*slot, Slot::Open(_)));
+        let open = |entry: &&Arc<Entry>| entry.slot.try_lock().map_or(true, |slot| matches!(*slot, Slot::Open(..)));
         self.entries().iter().filter(open).count()
     }
 
@@ -264,27 +273,36 @@ impl Images {
     /// The image of this id, in memory. Blocks.
     pub(super) fn find(&self, id: &Id) -> Result<Opened, Refusal> {
         let entry = self.lock().get(id).cloned().ok_or_else(|| no_image(&id.0))?;
-        let image = self.load(&entry)?.ok_or_else(|| no_image(&id.0))?;
+        let opened = self.load(&entry)?.ok_or_else(|| no_image(&id.0))?;
         self.touch(&entry);
-        Ok(Opened { entry, image })
+        Ok(opened)
     }
 
     /// An entry's image, from the disk if it is not in memory or has failed; none if it is gone.
-    fn load(&self, entry: &Entry) -> Result<Option<Arc<Image>>, Refusal> {
+    fn load(&self, entry: &Arc<Entry>) -> Result<Option<Opened>, Refusal> {
         let mut slot = entry.slot();
+        let opened = |image: &Arc<Image>, memory: &Memory| {
+            Some(Opened { entry: Arc::clone(entry), image: Arc::clone(image), memory: memory.clone() })
+        };
         match &*slot {
-            Slot::Open(image) if image.failed().is_none() => return Ok(Some(Arc::clone(image))),
-            Slot::Open(image) => image.close(),
+            Slot::Open(image, memory) if image.failed().is_none() => return Ok(opened(image, memory)),
+            // It makes room for what it was before.
+            Slot::Open(image, _) => {
+                let summary = super::images::summary(&entry.id, image);
+                image.close();
+                *slot = Slot::Closed(summary);
+            }
             Slot::Closed(_) => {}
             Slot::Damaged(why) => return Err(super::problem::storage("damaged", why).into()),
             Slot::Gone => return Ok(None),
         }
-        match Image::open(Box::new(Directory::new(self.folder.join(&entry.id.0)))) {
-            Ok(image) => {
-                let image = Arc::new(image);
-                *slot = Slot::Open(Arc::clone(&image));
-                Ok(Some(image))
+        match self.read(&self.folder.join(&entry.id.0)) {
+            Ok(Ok((image, memory))) => {
+                let found = opened(&image, &memory);
+                *slot = Slot::Open(image, memory);
+                Ok(found)
             }
+            Ok(Err(error)) => Err(no_memory(error)),
             Err(error) => {
                 if error.is_damage() {
                     *slot = Slot::Damaged(error.to_string());
@@ -297,7 +315,7 @@ impl Images {
     /// The image of this id, if it is still there; nobody has asked for it. Blocks.
     pub(super) fn again(&self, id: &Id) -> Result<Option<Opened>, Refusal> {
         let Some(entry) = self.lock().get(id).cloned() else { return Ok(None) };
-        Ok(self.load(&entry)?.map(|image| Opened { entry, image }))
+        self.load(&entry)
     }
 
     fn touch(&self, entry: &Entry) {
@@ -353,18 +371,19 @@ impl Images {
             all.insert(id.clone(), Arc::clone(&entry));
             break;
         }
-        let made = self.create(&id, &description);
-        match made {
+        let mut permit = self.memory.none();
+        let room = self.reserve(&mut permit, description.index_bytes() + INDEX_STEP).map_err(no_memory);
+        match room.and_then(|()| Ok(self.create(&id, &description)?)) {
             Ok(image) => {
-                let image = Arc::new(image);
-                *slot = Slot::Open(Arc::clone(&image));
+                let (image, memory) = (Arc::new(image), Memory::new(permit));
+                *slot = Slot::Open(Arc::clone(&image), memory.clone());
                 drop(slot);
-                Ok((true, Opened { entry, image }))
+                Ok((true, Opened { entry, image, memory }))
             }
-            Err(error) => {
+            Err(refusal) => {
                 drop(slot);
                 self.lock().remove(&id);
-                Err(error.into())
+                Err(refusal)
             }
         }
     }
@@ -463,7 +482,7 @@ impl Images {
                     }
                 }
             } else if now.saturating_sub(entry.touched()) >= self.idle.as_secs() {
-                entry.close();
+                entry.close(false);
             }
         }
     }
@@ -486,7 +505,7 @@ impl Images {
     pub(super) fn list(&self) -> Vec<Value> {
         let one = |entry: &Arc<Entry>| {
             let mut summary = match &*entry.slot() {
-                Slot::Open(image) => super::images::summary(&entry.id, image),
+                Slot::Open(image, _) => super::images::summary(&entry.id, image),
                 Slot::Closed(summary) if summary.is_object() => summary.clone(),
                 Slot::Closed(_) => json!({ "id": entry.id.0 }),
                 Slot::Damaged(why) => json!({ "id": entry.id.0, "damaged": why }),
@@ -500,10 +519,11 @@ impl Images {
 }
 
 impl Entry {
-    /// Closes the image if nobody uses it.
-    fn close(&self) {
-        let mut slot = self.slot();
-        let Slot::Open(image) = &*slot else { return };
+    /// Closes the image if nobody uses it; `at_once` if nobody holds its slot either, who may himself wait for another's.
+    pub(super) fn close(&self, at_once: bool) {
+        let slot = if at_once { self.slot.try_lock().ok() } else { Some(self.slot()) };
+        let Some(mut slot) = slot else { return };
+        let Slot::Open(image, _) = &*slot else { return };
         // Nobody else can get hold of it meanwhile.
         if slot.is_used() || image.failed().is_some() || !image.read().idle() {
             return;

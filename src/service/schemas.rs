@@ -126,7 +126,8 @@ schemas! {
     struct WaitingRegion {
         /// The region: x, y, width, height.
         region: [u32; 4],
-        /// `waiting`, `ready`, `running`, or `filtered` from pixels whose cores have not come.
+        /// `waiting`, `ready`, `running`, `too_large` for the memory there is, or `filtered` from pixels whose cores have
+        /// not come.
         state: String,
         /// If it is `waiting`: what is missing of the pixels that it reads; if `filtered`, of their cores; the first 16.
         #[schema(nullable = false)]

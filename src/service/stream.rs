@@ -166,7 +166,7 @@ impl Call {
                 Ok("filtered")
             }
             Target::Image { image, replace } => {
-                let state = match image.offer(&tile, *replace)? {
+                let state = match image.offer(&tile, *replace, &self.service)? {
                     Outcome::Repeated => {
                         held.free(tile, &self.service);
                         "repeated"

@@ -187,7 +187,8 @@ impl Pending {
 
 #[derive(Debug, Default)]
 struct Entry {
-    stored: Option<Stored>,
+    /// Apart from the list, which has empty places.
+    stored: Option<Box<Stored>>,
     pending: Vec<Pending>,
 }
 
@@ -378,7 +379,7 @@ impl Stitcher {
         write()?;
         let mut report = report.clone();
         count(&mut self.left_out, &mut report);
-        entry.stored = Some(Stored { digest: claim.digest, turn: claim.turn, report });
+        entry.stored = Some(Box::new(Stored { digest: claim.digest, turn: claim.turn, report }));
         self.done += core.area();
         Ok(Added::Stored)
     }
@@ -402,7 +403,8 @@ impl Stitcher {
         }
         let mut report = report;
         count(&mut self.left_out, &mut report);
-        self.insert(core, Entry { stored: Some(Stored { digest, turn: 0, report }), pending: Vec::new() })?;
+        let stored = Some(Box::new(Stored { digest, turn: 0, report }));
+        self.insert(core, Entry { stored, pending: Vec::new() })?;
         self.done += core.area();
         Ok(())
     }

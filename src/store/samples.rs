@@ -1,11 +1,13 @@
 //! Samples of an image, core by core, in a file that stays: compressed, found by [`Extent`]s, given back when they are
 //! not needed any more.
 //!
-//! A core's samples are a *head* and *blocks*. A block is up to 65536 values of one plane (f32; or, of the counts, u16),
+//! A core's samples are a *head* and *blocks*. A block is up to 8192 values of one plane (f32; or, of the counts, u16),
 //! their bytes ordered by significance, as one zstd frame with a checksum. The head says which planes are constant and
-//! how long each block is; its hash is in the extent. So whatever is read back is what was written, or an error.
+//! how long each block is; its hash is in the extent. So whatever is read back is what was written, or an error. Blocks
+//! are small, since neighbours read parts of a core over and over; earlier versions, whose files are still read, had
+//! larger ones.
 
-use std::{cell::RefCell, io, path::PathBuf, sync::Arc};
+use std::{array, cell::RefCell, io, path::PathBuf, sync::Arc};
 
 use super::{
     SpoolError,
@@ -18,14 +20,15 @@ use crate::{
 
 /// Name of the file in its folder.
 pub const SAMPLES_FILE: &str = "samples";
-/// Values of a block.
-const BLOCK: u64 = 1 << 16;
+/// Values of a block, and of one that an earlier version wrote.
+const BLOCK: u64 = 1 << 13;
+const EARLIER: u64 = 1 << 16;
 /// Favour speed: noise does not compress well anyway.
 const LEVEL: i32 = 1;
 /// File systems give back whole pages only.
 const PAGE: u64 = 4096;
 /// Memory that writing or reading a core takes at most beside the samples: a few blocks, and what zstd needs.
-pub const BUFFERS: u64 = 4 << 20;
+pub const BUFFERS: u64 = 1 << 20;
 
 /// Where the samples of a core are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -160,14 +163,14 @@ impl SampleFile {
         let mut head = Vec::with_capacity((5 + counts + tables) as usize);
         let mut out = BlockWriter::new(&*self.file, offset + 5 + counts + tables)?;
         if tile.varying() {
-            head.push(1);
+            head.push(3);
             head.extend_from_slice(&[0; 4]);
             for y in part.y..part.bottom() {
                 pixels(y).try_for_each(|p| out.push(&(tile.samples_of(p).len() as u16).to_le_bytes(), &mut head))?;
             }
             out.end(&mut head)?;
         } else {
-            head.push(0);
+            head.push(2);
             head.extend_from_slice(&tile.max_per_pixel().to_le_bytes());
         }
         for plane in 0..self.channels.planes() {
@@ -206,7 +209,11 @@ impl SampleFile {
     /// A tile of this geometry, from sources whose used pixels do not overlap; pixels of none of them are pixels without
     /// samples.
     pub fn cut(&self, geometry: TileGeometry, sources: &[Source]) -> Result<SampleTile, SpoolError> {
-        let reader = Reader { file: &*self.file, cache: RefCell::default() };
+        let reader = Reader {
+            file: &*self.file,
+            caches: RefCell::default(),
+            decompressor: RefCell::new(zstd::bulk::Decompressor::new()?),
+        };
         let pieces = sources.iter().map(|&Source { stored, extent, used }| {
             let part = StoredPart::open(&reader, stored, &extent, self.channels.planes());
             Ok(Piece { stored, used, part: part.map_err(|error| named(&self.path, error))? })
@@ -291,10 +298,11 @@ impl<'a> BlockWriter<'a> {
     }
 }
 
-/// Reads blocks, and keeps the last.
+/// Reads blocks, and keeps the last of the counts and the last of a plane: they are read in turn.
 struct Reader<'a> {
     file: &'a dyn Storage,
-    cache: RefCell<Cache>,
+    caches: RefCell<[Cache; 2]>,
+    decompressor: RefCell<zstd::bulk::Decompressor<'static>>,
 }
 
 #[derive(Default)]
@@ -302,6 +310,7 @@ struct Cache {
     /// Where the block is, of which these are the values by significance.
     block: Option<u64>,
     bytes: Vec<u8>,
+    compressed: Vec<u8>,
 }
 
 /// Blocks of a plane, or of the counts.
@@ -310,41 +319,60 @@ struct Blocks {
     /// Where each starts, and the end of the last.
     starts: Vec<u64>,
     values: u64,
+    /// Values of each but the last.
+    block: u64,
+}
+
+fn damaged(why: impl std::fmt::Display) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidData, format!("it is damaged: {why}"))
 }
 
 impl Reader<'_> {
     /// Reads values of `N` bytes from this one on.
-    fn read<const N: usize>(
+    fn read<T, const N: usize>(
         &self,
         blocks: &Blocks,
         from: u64,
-        count: u64,
-        mut put: impl FnMut([u8; N]),
+        mut into: &mut [T],
+        value: impl Fn([u8; N]) -> T,
     ) -> io::Result<()> {
-        let invalid = |why: &str| io::Error::new(io::ErrorKind::InvalidData, format!("it is damaged: {why}"));
-        let (mut at, end) = (from, from + count);
-        if end > blocks.values {
-            return Err(invalid("a core has fewer samples than it should"));
+        if from + into.len() as u64 > blocks.values {
+            return Err(damaged("a core has fewer samples than it should"));
         }
-        let mut cache = self.cache.borrow_mut();
-        while at < end {
-            let index = (at / BLOCK) as usize;
-            let (first, start, stop) = (index as u64 * BLOCK, blocks.starts[index], blocks.starts[index + 1]);
-            let values = (blocks.values - first).min(BLOCK) as usize;
-            if cache.block != Some(start) {
-                cache.block = None;
-                let mut compressed = vec![0; (stop - start) as usize];
-                self.file.read(start, &mut compressed)?;
-                cache.bytes =
-                    zstd::bulk::decompress(&compressed, values * N).map_err(|_| invalid("a block of samples"))?;
-                if cache.bytes.len() != values * N {
-                    return Err(invalid("a block of samples has another length"));
-                }
-                cache.block = Some(start);
+        let cache = &mut self.caches.borrow_mut()[usize::from(N == 4)];
+        let mut at = from;
+        while !into.is_empty() {
+            let index = (at / blocks.block) as usize;
+            let first = index as u64 * blocks.block;
+            let values = (blocks.values - first).min(blocks.block) as usize;
+            self.unpack(blocks.starts[index], blocks.starts[index + 1], values * N, cache)?;
+            let skipped = (at - first) as usize;
+            let (now, later) = into.split_at_mut((values - skipped).min(into.len()));
+            let bytes: [&[u8]; N] = array::from_fn(|byte| &cache.bytes[byte * values + skipped..][..now.len()]);
+            for (i, slot) in now.iter_mut().enumerate() {
+                *slot = value(array::from_fn(|byte| bytes[byte][i]));
             }
-            let range = (at - first) as usize..((end - first) as usize).min(values);
-            at = first + range.end as u64;
-            range.for_each(|i| put(std::array::from_fn(|byte| cache.bytes[byte * values + i])));
+            at += now.len() as u64;
+            into = later;
+        }
+        Ok(())
+    }
+
+    /// Unpacks the block between these places, of so many bytes, unless it is there.
+    fn unpack(&self, start: u64, end: u64, length: usize, cache: &mut Cache) -> io::Result<()> {
+        let Cache { block, bytes, compressed } = cache;
+        if *block != Some(start) {
+            *block = None;
+            compressed.resize((end - start) as usize, 0);
+            self.file.read(start, compressed)?;
+            bytes.clear();
+            bytes.reserve_exact(length);
+            let unpacked = self.decompressor.borrow_mut().decompress_to_buffer(compressed, bytes);
+            unpacked.map_err(|_| damaged("a block of samples"))?;
+            if bytes.len() != length {
+                return Err(damaged("a block of samples has another length"));
+            }
+            *block = Some(start);
         }
         Ok(())
     }
@@ -362,7 +390,7 @@ struct StoredPart<'a> {
 
 impl<'a> StoredPart<'a> {
     fn open(reader: &'a Reader<'a>, core: Rect, extent: &Extent, planes: usize) -> io::Result<Self> {
-        let invalid = || io::Error::new(io::ErrorKind::InvalidData, format!("it is damaged: the head of tile {core}"));
+        let invalid = || damaged(format_args!("the head of tile {core}"));
         let mut bytes = vec![0; extent.head as usize];
         reader.file.read(extent.offset, &mut bytes)?;
         if hash(&bytes) != extent.check {
@@ -371,19 +399,20 @@ impl<'a> StoredPart<'a> {
         let (mut head, mut at) = (&bytes[..], extent.offset + u64::from(extent.head));
         let mut part = Self { reader, uniform: None, counts: Blocks::default(), rows: Vec::new(), planes: Vec::new() };
         let mut samples = 0;
-        match (byte(&mut head), number(&mut head)) {
-            (Some(0), Some(n)) if n <= MAX_SAMPLES_PER_PIXEL => {
+        let kind = byte(&mut head).ok_or_else(invalid)?;
+        let block = if kind < 2 { EARLIER } else { BLOCK };
+        match (kind, number(&mut head)) {
+            (0 | 2, Some(n)) if n <= MAX_SAMPLES_PER_PIXEL => {
                 part.uniform = Some(n);
                 samples += core.area() * u64::from(n);
             }
-            (Some(1), Some(_)) => {
-                part.counts = blocks(&mut head, &mut at, core.area()).ok_or_else(invalid)?;
+            (1 | 3, Some(_)) => {
+                part.counts = blocks(&mut head, &mut at, core.area(), block).ok_or_else(invalid)?;
                 part.rows.push(0);
+                let mut counts = vec![0; core.width as usize];
                 for row in 0..u64::from(core.height) {
-                    let width = u64::from(core.width);
-                    reader.read(&part.counts, row * width, width, |count| {
-                        samples += u64::from(u16::from_le_bytes(count));
-                    })?;
+                    reader.read(&part.counts, row * u64::from(core.width), &mut counts, u16::from_le_bytes)?;
+                    samples += counts.iter().map(|&count| u64::from(count)).sum::<u64>();
                     part.rows.push(samples);
                 }
             }
@@ -392,7 +421,7 @@ impl<'a> StoredPart<'a> {
         for _ in 0..planes {
             let plane = match byte(&mut head) {
                 Some(0) => Err(f32::from_bits(number(&mut head).ok_or_else(invalid)?)),
-                Some(1) => Ok(blocks(&mut head, &mut at, samples).ok_or_else(invalid)?),
+                Some(1) => Ok(blocks(&mut head, &mut at, samples, block).ok_or_else(invalid)?),
                 _ => return Err(invalid()),
             };
             part.planes.push(plane);
@@ -413,15 +442,15 @@ fn number(head: &mut &[u8]) -> Option<u32> {
     Some(u32::from_le_bytes(*first))
 }
 
-fn blocks(head: &mut &[u8], at: &mut u64, values: u64) -> Option<Blocks> {
+fn blocks(head: &mut &[u8], at: &mut u64, values: u64, block: u64) -> Option<Blocks> {
     let mut starts = vec![*at];
-    for _ in 0..values.div_ceil(BLOCK) {
+    for _ in 0..values.div_ceil(block) {
         let compressed =
-            number(head).filter(|&bytes| bytes as usize <= zstd::zstd_safe::compress_bound(4 * BLOCK as usize))?;
+            number(head).filter(|&bytes| bytes as usize <= zstd::zstd_safe::compress_bound(4 * block as usize))?;
         *at += u64::from(compressed);
         starts.push(*at);
     }
-    Some(Blocks { starts, values })
+    Some(Blocks { starts, values, block })
 }
 
 impl Part for StoredPart<'_> {
@@ -430,13 +459,7 @@ impl Part for StoredPart<'_> {
     }
 
     fn counts(&self, pixel: u64, into: &mut [u16]) -> io::Result<()> {
-        let count = into.len() as u64;
-        let mut slots = into.iter_mut();
-        self.reader.read(&self.counts, pixel, count, |value| {
-            if let Some(slot) = slots.next() {
-                *slot = u16::from_le_bytes(value);
-            }
-        })
+        self.reader.read(&self.counts, pixel, into, u16::from_le_bytes)
     }
 
     fn row_start(&self, row: u32) -> io::Result<u64> {
@@ -449,12 +472,78 @@ impl Part for StoredPart<'_> {
 
     fn values(&self, plane: usize, sample: u64, into: &mut [f32]) -> io::Result<()> {
         let Ok(blocks) = &self.planes[plane] else { return Ok(()) };
-        let count = into.len() as u64;
-        let mut slots = into.iter_mut();
-        self.reader.read(blocks, sample, count, |value| {
-            if let Some(slot) = slots.next() {
-                *slot = f32::from_le_bytes(value);
+        self.reader.read(blocks, sample, into, f32::from_le_bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        disk::Directory,
+        filter::{Channel, Counts, Role},
+    };
+
+    const RECT: Rect = Rect { x: 0, y: 0, width: 300, height: 300 };
+
+    /// Values of a plane with 2 samples a pixel: three blocks of an earlier version, many of this one.
+    fn values(plane: u32) -> Vec<f32> {
+        (0..RECT.area() as u32 * 2).map(|i| (i.wrapping_mul(2_654_435_761 + plane) >> 9) as f32).collect()
+    }
+
+    fn tile(geometry: TileGeometry, channels: &ChannelSet, counts: Counts) -> SampleTile {
+        let planes = (0..3).map(|plane| Plane::Values(values(plane))).collect();
+        SampleTile::new(geometry, channels.clone(), counts, planes).unwrap()
+    }
+
+    #[test]
+    fn what_was_written_is_read_also_if_an_earlier_version_did() {
+        let folder = tempfile::tempdir().unwrap();
+        let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+        let file = SampleFile::create(&Directory::new(folder.path()), channels.clone()).unwrap();
+        let whole = TileGeometry::with_halo([300, 300], RECT, 0).unwrap();
+        let part = TileGeometry::with_halo([300, 300], Rect::new(120, 70, 90, 200), 9).unwrap();
+        let window = part.window();
+        let pixels =
+            (window.y..window.bottom()).flat_map(|y| (window.x..window.right()).map(move |x| RECT.index(x, y)));
+        let pixels: Vec<usize> = pixels.collect();
+        // Of every third pixel the next has a sample.
+        let counts: Vec<u16> = (0..RECT.area()).map(|i| [3, 1, 2][i as usize % 3]).collect();
+        for counts in [Counts::Uniform(2), Counts::Varying(counts)] {
+            let stored = tile(whole, &channels, counts.clone());
+            let mut extents = vec![file.append(&stored, &RECT).unwrap()];
+            if counts == Counts::Uniform(2) {
+                extents.push(append_as_before(&file));
             }
-        })
+            for extent in extents {
+                let cut = file.cut(part, &[Source { stored: RECT, extent, used: RECT }]).unwrap();
+                for (here, &there) in pixels.iter().enumerate() {
+                    let (here, there) = (cut.samples_of(here), stored.samples_of(there));
+                    assert_eq!(here.len(), there.len());
+                    for plane in 0..3 {
+                        let there = there.clone().map(|sample| stored.value(plane, sample));
+                        assert!(here.clone().map(|sample| cut.value(plane, sample)).eq(there));
+                    }
+                }
+            }
+        }
+    }
+
+    /// As the first version wrote the uniform samples.
+    fn append_as_before(file: &SampleFile) -> Extent {
+        let (mut head, mut blocks) = (vec![0, 2, 0, 0, 0], Vec::new());
+        for plane in 0..3 {
+            head.push(1);
+            for block in values(plane).chunks(1 << 16) {
+                let bytes = (0..4).flat_map(|byte| block.iter().map(move |value| value.to_le_bytes()[byte]));
+                let packed = zstd::bulk::compress(&bytes.collect::<Vec<u8>>(), 1).unwrap();
+                head.extend_from_slice(&(packed.len() as u32).to_le_bytes());
+                blocks.extend(packed);
+            }
+        }
+        let offset = 64 << 20;
+        file.file.write(offset, &head).unwrap();
+        file.file.write(offset + head.len() as u64, &blocks).unwrap();
+        Extent { offset, len: (head.len() + blocks.len()) as u64, head: head.len() as u32, check: hash(&head) }
     }
 }

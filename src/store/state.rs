@@ -8,7 +8,7 @@ use std::{
     sync::Arc,
 };
 
-use redb::{Database, ReadableDatabase, ReadableTable, StorageBackend, TableDefinition};
+use redb::{Database, ReadableDatabase, ReadableTable, ReadableTableMetadata, StorageBackend, TableDefinition};
 
 use crate::{
     disk::{Folder, Storage, is_full},
@@ -18,7 +18,7 @@ use crate::{
 /// Name of the file in its folder.
 pub const STATE_FILE: &str = "state.redb";
 /// Memory for pages of the file.
-const CACHE: usize = 1 << 20;
+pub const CACHE: usize = 128 << 10;
 /// Bytes of disk that a store takes at most without records, and for each record of up to 256 bytes: it writes beside
 /// what is there, and grows in steps.
 pub const STATE_BYTES: (u64, u64) = (4 << 20, 1 << 10);
@@ -173,6 +173,14 @@ impl State {
         guarded(&self.path, || {
             let table = self.database.begin_read()?.open_table(FACTS)?;
             Ok(table.get(name)?.map(|value| value.value().to_vec()))
+        })
+    }
+
+    /// How many of some records there are.
+    pub fn count(&self, records: Records) -> Result<u64, StateError> {
+        guarded(&self.path, || match self.database.begin_read()?.open_table(records.table()) {
+            Err(redb::TableError::TableDoesNotExist(_)) => Ok(0),
+            table => Ok(table?.len()?),
         })
     }
 

@@ -123,7 +123,7 @@ fn an_image_larger_than_the_memory_passes_through_it() {
     let peak = process.peak_memory();
     println!(
         "{side} x {side}, --memory {} MiB: {} MiB of samples sent in {:.0} s, at most {} MiB of them on the disk; filtered after \
-         {:.0} s, fetched after {:.0} s; CPU {:.0} s, outside of the filter's threads {:.0} s; peak {:.1} MiB",
+         {:.0} s, fetched after {:.0} s; CPU {:.1} s, outside of the filter's threads {:.1} s; peak {:.1} MiB",
         memory / MIB,
         sent / MIB,
         sending.as_secs_f64(),

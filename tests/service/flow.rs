@@ -3,7 +3,10 @@
 use super::{Answer, Server, samples, tile, wait_until, whole};
 use crate::load::process::Process;
 use rpfd::{
-    filter::{Channel, ChannelSet, Execution, Method, Rect, Role, TileGeometry, plan::Shape, plan::plan},
+    filter::{
+        Channel, ChannelSet, Counts, Execution, Method, Plane, Rect, Role, SampleTile, TileGeometry,
+        plan::{Shape, plan},
+    },
     synth::Scene,
     wire::{Format, Header, Message, SampleCounts, encode_header},
 };
@@ -47,9 +50,9 @@ fn codes(messages: &[Message]) -> Vec<&str> {
     codes.into_iter().map(|code| &*code.leak()).collect()
 }
 
-/// Memory for a budget of so much for tiles, where a quarter is for requests, as an argument.
+/// Memory for a budget of so much for tiles, where a quarter is for requests, and an eighth for images, as an argument.
 fn memory(tiles: u64) -> String {
-    ((tiles + 2) * 4 / 3).to_string()
+    ((tiles + 4) * 8 / 5).to_string()
 }
 
 fn needed(header: &Header, method: &Method) -> u64 {
@@ -247,6 +250,24 @@ fn a_varying_tile_is_admitted_by_its_counts() {
     }
 }
 
+/// Requests that hold all memory there is for requests need none of it to go on.
+#[test]
+fn tiles_whose_counts_vary_do_not_wait_for_each_other() {
+    // Room for six requests and their counts; eight come, of each a part at first.
+    let server = start(&["--memory", "8MiB"]);
+    let geometry = TileGeometry::with_halo([16, 16], Rect::new(0, 0, 16, 16), 0).unwrap();
+    let tile = Scene::by_name("all").unwrap().tile_varying(geometry, 2, &Execution::default()).unwrap();
+    let body = super::encode(&tile);
+    let begin = |_| server.send("/v1/filter?preset=gaussian", &[], &body[..8], body.len());
+    let mut streams: Vec<_> = (0..8).map(begin).collect();
+    for stream in &mut streams {
+        stream.write_all(&body[8..]).unwrap();
+    }
+    for stream in &mut streams {
+        assert_eq!(codes(&Answer::read(stream).messages()), [""; 0]);
+    }
+}
+
 #[test]
 fn requests_take_memory_too() {
     // Room for one request at a time.
@@ -260,4 +281,23 @@ fn requests_take_memory_too() {
     assert_eq!(server.get("/v1/images").status, 200);
     wait_until("its memory is free", || server.metric(MEMORY_USED) == Some(0.0));
     assert_eq!(server.post("/v1/filter", &body).messages().len(), 2);
+}
+
+/// Whatever else the tile would have to wait for.
+#[test]
+fn counts_that_never_fit_are_refused_at_once_with_the_size_that_would() {
+    let varying = |side: u32| {
+        let geometry = TileGeometry::with_halo([side, side], Rect::new(0, 0, side, side), 0).unwrap();
+        let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+        let counts = Counts::Varying((0..side * side).map(|i| 1 + (i % 2) as u16).collect());
+        let planes = [1.0, 2.0, 3.0].map(Plane::Constant).to_vec();
+        super::encode(&SampleTile::new(geometry, channels, counts, planes).unwrap())
+    };
+    // Half a MiB for counts.
+    let [no_room, room] = ["1MiB", "4GiB"].map(|unread| start(&["--memory", "8MiB", "--unread-results", unread]));
+    let problem = no_room.post("/v1/filter?preset=unfiltered", &varying(600)).problem(413, "over_memory");
+    assert_eq!((problem["needed"].as_u64(), problem["available"].as_u64()), (Some(720_000), Some(1 << 19)));
+    let fits = problem["fits"][0].as_u64().unwrap() as u32;
+    assert!((64..512).contains(&fits), "{problem}");
+    assert_eq!(codes(&room.post("/v1/filter?preset=unfiltered", &varying(fits)).messages()), [""; 0]);
 }

@@ -15,12 +15,12 @@ use std::{
 const IMAGE: [u32; 2] = [128, 128];
 
 /// Memory with which a service can take this tile, and no more beside it, as an argument: a quarter is for requests, of
-/// which there may be a few if the tile is large.
+/// which there may be a few if the tile is large, and an eighth for images.
 fn memory(side: u32, method: &Method) -> String {
     let tile = samples(IMAGE, Rect::new(0, 0, side, side), 0, 1);
     let header = Header::of(&tile, Format::F32).unwrap();
     let threads = Config::default().threads;
-    ((plan(&header.shape(), method).total(threads) + 1024) * 4 / 3).to_string()
+    ((plan(&header.shape(), method).total(threads) + 1024) * 8 / 5).to_string()
 }
 
 #[test]
@@ -84,8 +84,8 @@ fn nobody_has_to_read_while_sending() {
 
 #[test]
 fn a_client_that_only_sends_gets_its_refusal() {
-    let server = Server::start(&["--memory", "4MiB"]);
-    let body = whole(192);
+    let server = Server::start(&["--memory", "8MiB"]);
+    let body = whole(320);
     let zstd = ["Content-Encoding: zstd"];
     // What has stalled for about as long as the service waits for more, here or there, is tried again.
     let sent = |path: &str, headers: &[&str]| {

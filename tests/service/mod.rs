@@ -12,6 +12,7 @@ pub(crate) mod exact;
 pub(crate) mod flow;
 mod http2;
 mod images;
+mod index;
 mod limits;
 pub(crate) mod neighbors;
 mod observe;
@@ -20,6 +21,7 @@ mod proxy;
 mod recovering;
 mod stop;
 mod tokens;
+mod too_large;
 
 use std::{
     io::{BufRead, BufReader, Read, Write},
