@@ -14,7 +14,7 @@ use crate::{
 const SIDES: [u32; 10] = [512, 384, 320, 256, 192, 128, 96, 64, 32, 16];
 /// Of an image this many regions, at least, make it come out in parts while it comes in.
 const PARTS: u64 = 16;
-/// No region is smaller for that.
+/// No region is smaller for that, nor so that several fit into the memory at once: their halos would take most of the time.
 const LEAST: u32 = 64;
 
 impl Announced {
@@ -43,7 +43,7 @@ impl Announced {
             })
         };
         let sides = || SIDES.into_iter().filter(|&side| count(side) <= MAX_TILES as u64);
-        let parts = |side: &u32| *side <= LEAST || pixels / area(*side) >= PARTS;
+        let parts = |side: &u32| *side == LEAST || *side > LEAST && pixels / area(*side) >= PARTS;
         let found = sides().filter(parts).find(|&side| cost(side) <= bytes);
         match found.or_else(|| sides().find(|&side| cost(side) <= most)) {
             Some(side) => {
@@ -96,4 +96,27 @@ pub(super) fn small(core: &Rect, image: &Rect) -> Result<(), ImageError> {
     let wide = core.width >= MIN_CORE || core.x == 0 || core.right() == image.width;
     let high = core.height >= MIN_CORE || core.y == 0 || core.bottom() == image.height;
     if wide && high { Ok(()) } else { Err(ImageError::TooSmall(*core)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::filter::{Channel, ChannelSet, Role};
+
+    #[test]
+    fn regions_are_small_only_where_no_larger_one_fits() {
+        let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+        let mut announced = Announced { channels, samples: 4, varying: false, region: 0 };
+        let method = Method::preset("lean").unwrap();
+        let mut choose = |bytes, most| {
+            let chosen = announced.choose_region([1024, 1024], &method, 1, bytes, most);
+            chosen.map(|()| announced.region)
+        };
+        let least = choose(0, 0).unwrap_err();
+        assert_eq!(choose(least, least), Ok(16));
+        // Several small ones would fit at once: one large one is better.
+        let side = choose(least, 8 * least).unwrap();
+        assert!(side >= LEAST, "{side}");
+        assert_eq!(choose(u64::MAX, u64::MAX), Ok(256));
+    }
 }
