@@ -370,7 +370,8 @@ fn a_region_that_takes_too_long_is_stopped() {
         trouble["code"] == "work_timeout"
     });
     assert!(trouble["detail"].as_str().unwrap().contains("smaller parts"), "{trouble}");
-    wait_for("its memory to be free", || server.metric("rpfd_memory_used_bytes") == Some(0.0));
+    // What is known of the image stays; filtering takes many times as much.
+    wait_for("its memory to be free", || server.metric("rpfd_memory_used_bytes") < Some(1e6));
     assert!(server.metric("rpfd_regions_total{outcome=\"failed\"}") >= Some(1.0));
     // It is tried again, until the image is forgotten.
     wait_for("another attempt", || server.metric("rpfd_regions_total{outcome=\"failed\"}") >= Some(2.0));
