@@ -76,8 +76,8 @@ impl Charge {
         })
     }
 
-    /// As [`Self::add_window`] at the start of a body, when nothing else is held: waits for its turn, and until then gives back what it
-    /// has.
+    /// As [`Self::add_window`] at the start of a body, when nothing else is held: waits for its turn, and until then gives
+    /// back what it has.
     pub(super) async fn wait_window(&self, window: u64) -> Result<(), Refusal> {
         let bytes = REQUEST + OVERHEAD + window;
         let grown = self.permit().grow_to(bytes);
