@@ -1,6 +1,6 @@
 //! A disk that is full: files may not grow beyond a limit, and later they may.
 
-use crate::service::{Answer, Server, encode, exact::whole_exr, neighbors, samples, tile, wait_for};
+use crate::service::{Answer, Server, encode, exact::whole_exr, neighbors, samples, tile, wait_until};
 use rpfd::filter::{Method, Rect, geometry::tiling};
 use std::process::Command;
 
@@ -61,7 +61,7 @@ fn a_full_disk_refuses_tiles_and_the_image_stays_usable() {
         // What was refused is sent again; what was acknowledged is known.
         let lines = server.post("/v1/images/a/tiles", &body).lines();
         assert_eq!(lines.last().unwrap()["errors"], 0, "{lines:?}");
-        wait_for("the image", || server.get("/v1/images/a").json()["complete"] == true);
+        wait_until("the image", || server.get("/v1/images/a").json()["complete"] == true);
         assert!(server.get("/v1/images/a/result.exr").body == expected);
         let again = server.post("/v1/images/a/tiles", &encode(&samples(SIZE, cores[0], 0, 1))).lines();
         assert_eq!(again[0]["state"], "repeated");
@@ -118,7 +118,7 @@ fn a_full_file_system_refuses_tiles_and_the_image_stays_usable() {
         assert_eq!(lines.last().unwrap()["errors"], refused, "{lines:?}");
         // Without even that, none begins; what an answer took may be free a little later.
         let full = |what: &str, status: u16, code: &str, ask: &dyn Fn() -> Answer| {
-            wait_for(what, || {
+            wait_until(what, || {
                 fill(&file);
                 let answer = ask();
                 answer.status >= 500 && answer.problem(status, code).is_object()
@@ -132,7 +132,7 @@ fn a_full_file_system_refuses_tiles_and_the_image_stays_usable() {
         std::fs::remove_file(&ballast).unwrap();
         let lines = server.post("/v1/images/a/tiles", &body).lines();
         assert_eq!(lines.last().unwrap()["errors"], 0, "{lines:?}");
-        wait_for("the image", || server.get("/v1/images/a").json()["complete"] == true);
+        wait_until("the image", || server.get("/v1/images/a").json()["complete"] == true);
         assert!(server.get("/v1/images/a/result.exr").body == expected);
         server.get("/v1/images/b").problem(404, "unknown_image");
     }

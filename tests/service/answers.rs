@@ -1,6 +1,6 @@
 //! Answers on their way: what they take of the disk is reserved, and given back when nobody wants them any more.
 
-use super::{Answer, Server, head, wait_for};
+use super::{Answer, Server, head, wait_until};
 use rpfd::{
     filter::{Channel, ChannelSet, Rect, Role, TileGeometry},
     wire::{Format, Header, SampleCounts, encode_header},
@@ -50,16 +50,16 @@ fn what_nobody_reads_is_reserved_and_beyond_the_limit_refused() {
     half(&server, SIZE);
     let (exr, png) = ("/v1/images/a/result.exr?partial=true&compression=none", "/v1/images/a/preview.png?partial=true");
     let unread = ask(&server, exr);
-    wait_for("the answer to be kept", || server.metric(UNREAD) > Some(f64::from(12 << 20)));
+    wait_until("the answer to be kept", || server.metric(UNREAD) > Some(f64::from(12 << 20)));
     assert!(server.metric(UNREAD) <= Some(f64::from(16 << 20)));
     let problem = server.get(exr).problem(507, "results_unread");
     assert!(problem["detail"].as_str().unwrap().contains("read theirs"), "{problem}");
     // What is smaller has room.
     assert_eq!((server.get(png).status, server.get("/v1/images/a").status), (200, 200));
     drop(unread);
-    wait_for("the room to be free", || server.metric(UNREAD) == Some(0.0));
+    wait_until("the room to be free", || server.metric(UNREAD) == Some(0.0));
     assert_eq!(server.get(exr).status, 200);
-    wait_for("the room to be free", || server.metric(UNREAD) == Some(0.0));
+    wait_until("the room to be free", || server.metric(UNREAD) == Some(0.0));
     let few = Server::start(&["--unread-results", "1MiB"]);
     half(&few, SIZE);
     few.get(exr).problem(507, "results_unread");
@@ -80,23 +80,23 @@ fn a_result_has_the_images_own_room_once() {
     assert!(set_aside > Some(f64::from(1024 * 1024 * 2 * 36)));
     let path = "/v1/images/a/result.exr?compression=none";
     let mut first = ask(&server, path);
-    wait_for("the result", || server.data_dir().join("images/a/result.exr").exists());
+    wait_until("the result", || server.data_dir().join("images/a/result.exr").exists());
     let again = ask(&server, path);
-    wait_for("both to be under way", || server.metric(IN_FLIGHT) == Some(2.0));
+    wait_until("both to be under way", || server.metric(IN_FLIGHT) == Some(2.0));
     assert_eq!(server.metric(UNREAD), Some(0.0));
     // Another form of it, while the one that is kept is read.
     let other = ask(&server, "/v1/images/a/result.exr?compression=none&layout=tiles");
-    wait_for("the other form", || server.metric(UNREAD) > Some(f64::from(24 << 20)));
+    wait_until("the other form", || server.metric(UNREAD) > Some(f64::from(24 << 20)));
     // Without the image its disk is free only when nobody reads of it any more.
     assert_eq!(server.call("DELETE", "/v1/images/a", &[], &[]).status, 204);
     drop(other);
-    wait_for("the other form's room to be free", || server.metric(UNREAD) == Some(0.0));
+    wait_until("the other form's room to be free", || server.metric(UNREAD) == Some(0.0));
     assert_eq!(server.metric(IMAGES), set_aside);
     let answer = Answer::read(&mut first);
     assert!(answer.status == 200 && answer.body.len() > 24 << 20, "{}", answer.status);
     assert_eq!(server.metric(IMAGES), set_aside);
     drop((first, again));
-    wait_for("the image's room to be free", || server.metric(IMAGES) == Some(0.0));
+    wait_until("the image's room to be free", || server.metric(IMAGES) == Some(0.0));
 }
 
 #[test]
@@ -114,21 +114,21 @@ fn a_client_that_leaves_stops_the_encoding_of_its_result() {
     // then another form of it is asked for.
     let kept = || std::fs::metadata(folder.join("result.exr")).ok().map(|file| file.ino());
     // What is known of the image.
-    wait_for("nothing else to be under way", || server.metric(IN_FLIGHT) == Some(0.0));
+    wait_until("nothing else to be under way", || server.metric(IN_FLIGHT) == Some(0.0));
     let known = server.metric("rpfd_memory_used_bytes");
     let stopped = (16..48).any(|side| {
         let before = kept();
         let gone = ask(&server, &format!("{path}?compression=piz&tile={side}"));
-        wait_for("the encoding to begin", || beginnings() == 1 || kept() != before);
+        wait_until("the encoding to begin", || beginnings() == 1 || kept() != before);
         drop(gone);
-        wait_for("the encoding to end", || server.metric(IN_FLIGHT) == Some(0.0) && beginnings() == 0);
+        wait_until("the encoding to end", || server.metric(IN_FLIGHT) == Some(0.0) && beginnings() == 0);
         kept() == before
     });
     assert!(stopped, "it was encoded all the same");
     for metric in [IN_FLIGHT, UNREAD] {
-        wait_for(metric, || server.metric(metric) == Some(0.0));
+        wait_until(metric, || server.metric(metric) == Some(0.0));
     }
-    wait_for("its memory to be free", || server.metric("rpfd_memory_used_bytes") <= known);
+    wait_until("its memory to be free", || server.metric("rpfd_memory_used_bytes") <= known);
     // The next has its turn.
     assert_eq!(server.get(path).status, 200);
 }

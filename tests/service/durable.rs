@@ -1,6 +1,6 @@
 //! What an image has survives: kills, new starts, damaged files, a full disk. Images end when nobody uses them.
 
-use super::{Answer, Server, encode, exact::whole_exr, neighbors, samples, tile, wait_for};
+use super::{Answer, Server, encode, exact::whole_exr, neighbors, samples, tile, wait_until};
 use rpfd::filter::{Method, Rect};
 use serde_json::json;
 use std::{io::Write, process::Command};
@@ -139,7 +139,7 @@ fn a_damaged_file_is_named_and_leaves_other_images_alone() {
     // Samples are read when they are needed.
     server.post("/v1/images/samples/tiles", &tile([64, 64], Rect::new(32, 0, 32, 64), 0)).lines();
     let mut status = json!({});
-    wait_for("the damage to show", || {
+    wait_until("the damage to show", || {
         status = server.get("/v1/images/samples").json();
         status["trouble"]["code"] == "damaged"
     });
@@ -161,8 +161,8 @@ fn images_that_nobody_uses_leave_the_memory_and_come_back() {
     assert_eq!(server.post("/v1/images", &opening).status, 201);
     let bare = |core| server.post("/v1/images/b/tiles", &tile(SIZE, core, 0)).lines()[0]["state"].clone();
     let asleep = || {
-        wait_for("the images to leave the memory", || server.metric("rpfd_images_in_memory") == Some(0.0));
-        wait_for("their files to be closed", || {
+        wait_until("the images to leave the memory", || server.metric("rpfd_images_in_memory") == Some(0.0));
+        wait_until("their files to be closed", || {
             let open = std::fs::read_dir(format!("/proc/{}/fd", server.pid())).unwrap();
             let mut open = open.filter_map(|fd| std::fs::read_link(fd.unwrap().path()).ok());
             !open.any(|path| path.starts_with(server.data_dir().join("images")))
@@ -193,10 +193,10 @@ fn images_that_nobody_uses_expire() {
     let (expires, after) = (opened.json()["expires"].as_u64().unwrap(), seconds());
     assert!(expires > before && expires <= after + 1, "{before} {expires} {after}");
     // The list is no use of them.
-    wait_for("the image to expire", || server.get("/v1/images").json()["images"] == json!([]));
+    wait_until("the image to expire", || server.get("/v1/images").json()["images"] == json!([]));
     server.get("/v1/images/a").problem(404, "unknown_image");
     // It is forgotten first, and its files are removed then.
-    wait_for("its files to be gone", || std::fs::read_dir(server.data_dir().join("images")).unwrap().count() == 0);
+    wait_until("its files to be gone", || std::fs::read_dir(server.data_dir().join("images")).unwrap().count() == 0);
 }
 
 #[test]
@@ -204,7 +204,7 @@ fn images_that_somebody_is_at_work_on_do_not_expire() {
     let server = Server::start(&["--image-ttl", "1"]);
     let (body, mut begun) = (tile(SIZE, LEFT, 0), None);
     // On a machine that stalls it may expire before somebody comes.
-    wait_for("somebody to be at work on it", || {
+    wait_until("somebody to be at work on it", || {
         open(&server, "a");
         begun = server.try_begin("/v1/images/a/tiles", &[], &body[..body.len() / 2], body.len());
         begun.is_some()
@@ -213,11 +213,11 @@ fn images_that_somebody_is_at_work_on_do_not_expire() {
     // The list is no use of it, and this stream began long before.
     let expires = || server.get("/v1/images").json()["images"][0]["expires"].as_u64();
     let first = expires().unwrap();
-    wait_for("three times its time", || expires().expect("the image is there") > first + 3);
+    wait_until("three times its time", || expires().expect("the image is there") > first + 3);
     stream.write_all(&body[body.len() / 2..]).unwrap();
     assert_eq!(Answer::read(&mut stream).lines()[0]["state"], "filtered");
     drop(stream);
-    wait_for("the image to expire", || expires().is_none());
+    wait_until("the image to expire", || expires().is_none());
 }
 
 #[test]

@@ -54,7 +54,7 @@ fn tiles_that_there_is_no_memory_to_know_of_are_refused() {
     let missing: u64 = status["missing"].as_array().unwrap().iter().map(area).sum();
     assert_eq!(missing, 256 * (1024 - stored.len() as u64));
     // Nobody uses it any more: another one may have its place, and it another's.
-    super::wait_for("the room of one that nobody uses", || open(&server, "b").status == 201);
+    super::wait_until("the room of one that nobody uses", || open(&server, "b").status == 201);
     assert_eq!(server.get("/v1/images/a").json()["tiles_done"], json!(stored.len()));
     // As long as somebody uses it, it stays.
     let mut stream = server.connect();
@@ -67,7 +67,7 @@ fn tiles_that_there_is_no_memory_to_know_of_are_refused() {
     assert!(busy.header("retry-after").is_some());
     server.get("/v1/images/c").problem(404, "unknown_image");
     drop(stream);
-    super::wait_for("room for another", || open(&server, "c").status == 201);
+    super::wait_until("room for another", || open(&server, "c").status == 201);
     // It is all there after another start.
     let server = Server::start_in(server.kill(), &arguments);
     assert_eq!(server.get("/v1/images/a").json()["tiles_done"], json!(stored.len()));

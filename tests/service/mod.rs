@@ -79,7 +79,7 @@ impl Server {
 
     /// Waits until it knows the images that were there.
     pub(crate) fn wait_recovered(&self) {
-        wait_for("the images to be recovered", || {
+        wait_until("the images to be recovered", || {
             let ready = self.get("/readyz");
             ready.status == 200 || ready.json()["code"] != "recovering"
         });
@@ -310,12 +310,6 @@ pub(crate) fn wait_until(what: &str, mut so: impl FnMut() -> bool) {
         assert!(started.elapsed() < LATEST, "waited in vain: {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
-}
-
-/// Waits for something.
-#[track_caller]
-pub(crate) fn wait_for(what: &str, done: impl FnMut() -> bool) {
-    wait_until(what, done);
 }
 
 fn unchunked(mut bytes: &[u8]) -> Vec<u8> {

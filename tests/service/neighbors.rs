@@ -1,6 +1,6 @@
 //! Images whose tiles come as bare cores, and lend each other their halos.
 
-use super::{Server, contradicting, encode, exact::whole_exr, samples, tile, wait_for};
+use super::{Server, contradicting, encode, exact::whole_exr, samples, tile, wait_until};
 use crate::stitch::shuffle;
 use rpfd::{
     disk::Directory,
@@ -36,13 +36,13 @@ fn open(server: &Server, size: [u32; 2], preset: &str) {
 }
 
 pub(crate) fn wait_complete(server: &Server, id: &str) {
-    wait_for("an image to be complete", || server.get(&format!("/v1/images/{id}")).json()["complete"] == true);
+    wait_until("an image to be complete", || server.get(&format!("/v1/images/{id}")).json()["complete"] == true);
 }
 
 /// Waits until hardly any samples are left on the disk.
 fn wait_dropped(server: &Server) {
     let samples = server.data_dir().join("images/a/samples");
-    wait_for("all samples to be dropped", || std::fs::metadata(&samples).unwrap().blocks() * 512 <= 8192);
+    wait_until("all samples to be dropped", || std::fs::metadata(&samples).unwrap().blocks() * 512 <= 8192);
 }
 
 fn states(lines: &[Value]) -> Vec<&str> {
@@ -132,7 +132,7 @@ fn an_image_says_which_regions_wait_for_what() {
     server.get("/v1/images/a/result.exr").problem(409, "image_incomplete");
     // With its neighbour the first can be filtered, the second not.
     server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(64, 0, 64, 64), 0)).lines();
-    wait_for("the first region", || server.get("/v1/images/a").json()["tiles_done"] == 1);
+    wait_until("the first region", || server.get("/v1/images/a").json()["tiles_done"] == 1);
     let status = server.get("/v1/images/a").json();
     assert_eq!(status["tiles"][0]["tile"], json!([0, 0, 64, 64]));
     assert_eq!(status["tiles"][0]["report"]["exact"], true);
@@ -215,7 +215,7 @@ fn an_image_is_finished_with_what_there_is() {
     server.post("/v1/images/a/tiles", &body).lines();
     let answer = server.post("/v1/images/a/finish", &[]);
     assert!([200, 202].contains(&answer.status) && answer.json()["finished"] == true, "{answer:?}");
-    wait_for("the regions", || server.get("/v1/images/a").json()["regions_open"] == 0);
+    wait_until("the regions", || server.get("/v1/images/a").json()["regions_open"] == 0);
     let status = server.get("/v1/images/a").json();
     let pixels: u64 = there.iter().map(Rect::area).sum();
     assert_eq!((&status["complete"], &status["pixels_done"]), (&json!(false), &json!(pixels)));
@@ -255,7 +255,7 @@ fn halos_stand_for_cores_that_have_not_come() {
     let second = contradicting(SIZE, Rect::new(64, 0, 64, 64), 17);
     server.post("/v1/images/a/tiles", &encode(&second)).lines();
     let filtered = |server: &Server, tiles: u64| {
-        wait_for("regions", || server.get("/v1/images/a").json()["tiles_done"] == tiles);
+        wait_until("regions", || server.get("/v1/images/a").json()["tiles_done"] == tiles);
         server.get("/v1/images/a").json()["waiting"].clone()
     };
     let waiting = json!([
@@ -273,7 +273,7 @@ fn halos_stand_for_cores_that_have_not_come() {
     assert_eq!(waiting[2]["for"], json!([[128, 0, 64, 64]]));
     server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(128, 0, 64, 64), 0)).lines();
     // The last of these is final: all that it reads came in cores.
-    wait_for("regions", || server.get("/v1/images/a").json()["regions_open"] == 2);
+    wait_until("regions", || server.get("/v1/images/a").json()["regions_open"] == 2);
     assert_eq!(filtered(&server, 3)[1]["for"], json!([[47, 0, 17, 64]]));
     // What was lent was not what the cores bring.
     server.get("/v1/images/a/result.exr").problem(409, "image_incomplete");
@@ -345,7 +345,7 @@ fn an_image_is_finished_with_what_halos_brought() {
     open(&server, SIZE, "lean");
     server.post("/v1/images/a/tiles", &tile(SIZE, core, 5)).lines();
     server.post("/v1/images/a/finish", &[]);
-    wait_for("the regions", || server.get("/v1/images/a").json()["regions_open"] == 0);
+    wait_until("the regions", || server.get("/v1/images/a").json()["regions_open"] == 0);
     let status = server.get("/v1/images/a").json();
     assert_eq!((&status["pixels_done"], &status["pixels_stored"]), (&json!(core.area()), &json!(core.area())));
     let exr = server.get("/v1/images/a/result.exr").body;
@@ -365,18 +365,18 @@ fn a_region_that_takes_too_long_is_stopped() {
     assert_eq!(server.post("/v1/images", opening.to_string().as_bytes()).status, 201);
     server.post("/v1/images/a/tiles", &tile(SIZE, Rect::new(0, 0, 48, 48), 0)).lines();
     let mut trouble = Value::Null;
-    wait_for("the time to be up", || {
+    wait_until("the time to be up", || {
         trouble = server.get("/v1/images/a").json()["trouble"].clone();
         trouble["code"] == "work_timeout"
     });
     assert!(trouble["detail"].as_str().unwrap().contains("smaller parts"), "{trouble}");
     // What is known of the image stays; filtering takes many times as much.
-    wait_for("its memory to be free", || server.metric("rpfd_memory_used_bytes") < Some(1e6));
+    wait_until("its memory to be free", || server.metric("rpfd_memory_used_bytes") < Some(1e6));
     assert!(server.metric("rpfd_regions_total{outcome=\"failed\"}") >= Some(1.0));
     // It is tried again, until the image is forgotten.
-    wait_for("another attempt", || server.metric("rpfd_regions_total{outcome=\"failed\"}") >= Some(2.0));
+    wait_until("another attempt", || server.metric("rpfd_regions_total{outcome=\"failed\"}") >= Some(2.0));
     assert_eq!(server.call("DELETE", "/v1/images/a", &[], &[]).status, 204);
-    wait_for("the work to end", || server.metric("rpfd_images_disk_bytes") == Some(0.0));
+    wait_until("the work to end", || server.metric("rpfd_images_disk_bytes") == Some(0.0));
 }
 
 /// Makes an image of bare cores with regions of this side, which is to become that of these samples.
@@ -400,15 +400,21 @@ fn exr_of(image: &Image, method: &Method) -> Vec<u8> {
     out.into_inner()
 }
 
-#[test]
-fn a_region_that_was_stopped_is_filtered_in_parts() {
-    const SIZE: [u32; 2] = [64, 48];
-    let (folder, method) = (tempfile::tempdir().unwrap(), Method::preset("lean").unwrap());
-    let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
-    create(folder.path(), &whole, &method, 64);
+/// An image of one region, all of whose samples have come.
+fn one_region(method: &Method) -> (tempfile::TempDir, SampleTile, Arc<Image>) {
+    let folder = tempfile::tempdir().unwrap();
+    let whole = samples([64, 48], Rect::new(0, 0, 64, 48), 0, 1);
+    create(folder.path(), &whole, method, 64);
     let image = reopen(folder.path());
     image.offer(&whole, false).unwrap();
     image.flush().unwrap();
+    (folder, whole, image)
+}
+
+#[test]
+fn a_region_that_was_stopped_is_filtered_in_parts() {
+    let method = Method::preset("lean").unwrap();
+    let (_folder, whole, image) = one_region(&method);
     let stop = AtomicBool::new(true);
     let stopped = Execution { stop: Some(&stop), ..Execution::default() };
     let job = image.next_job(1, u64::MAX, u64::MAX).unwrap().unwrap();
@@ -425,13 +431,8 @@ fn a_region_that_was_stopped_is_filtered_in_parts() {
 
 #[test]
 fn a_region_whose_filtering_panics_is_filtered_again() {
-    const SIZE: [u32; 2] = [64, 48];
-    let (folder, method) = (tempfile::tempdir().unwrap(), Method::preset("lean").unwrap());
-    let whole = samples(SIZE, Rect::new(0, 0, SIZE[0], SIZE[1]), 0, 1);
-    create(folder.path(), &whole, &method, 64);
-    let image = reopen(folder.path());
-    image.offer(&whole, false).unwrap();
-    image.flush().unwrap();
+    let method = Method::preset("lean").unwrap();
+    let (_folder, whole, image) = one_region(&method);
     let job = image.next_job(1, u64::MAX, u64::MAX).unwrap().unwrap();
     assert!(image.next_job(1, u64::MAX, u64::MAX).unwrap().is_none() && !image.read().idle());
     let panics = |_: f32| panic!("on purpose");

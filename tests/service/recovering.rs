@@ -1,6 +1,6 @@
 //! A service that is started again answers at once, and takes calls about images when it knows them.
 
-use super::{Server, wait_for, whole};
+use super::{Server, wait_until, whole};
 use std::{
     io::{BufRead, BufReader},
     process::{Command, Stdio},
@@ -55,7 +55,7 @@ fn it_answers_while_it_recovers() {
     let log = std::thread::spawn(move || {
         log.lines().filter(|line| line.as_ref().unwrap().contains("cannot be opened")).count()
     });
-    wait_for("the images to be recovered", || server.get("/readyz").status == 200);
+    wait_until("the images to be recovered", || server.get("/readyz").status == 200);
     assert_eq!(server.metric("rpfd_ready"), Some(1.0));
     assert_eq!(server.get("/v1/images").json()["images"].as_array().unwrap().len(), IMAGES);
     server.get("/v1/images/broken-1").problem(500, "damaged");

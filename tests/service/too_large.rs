@@ -4,7 +4,7 @@ use super::{
     Server, contradicting, encode,
     exact::whole_exr,
     neighbors::{opening, wait_complete},
-    samples, tile, wait_for,
+    samples, tile, wait_until,
 };
 use rpfd::filter::{Method, Rect, geometry::tiling};
 use serde_json::{Value, json};
@@ -27,16 +27,16 @@ fn a_region_that_is_too_large_keeps_no_others_waiting() {
         let corners = json!([region.x, region.y, region.width, region.height]);
         regions.iter().find(|waiting| waiting["region"] == corners).map_or(Value::Null, |found| found["state"].clone())
     };
-    wait_for("the region to be filtered early", || state(&server, early) == "filtered");
+    wait_until("the region to be filtered early", || state(&server, early) == "filtered");
     // The whole of a region does not fit any more, parts of it do.
     let server = Server::start_in(server.kill(), &arguments("7MiB"));
     let cores = tiling(SIZE, 32).filter(|core| core.intersection(&early).is_none());
     let body: Vec<u8> = cores.flat_map(|core| tile(SIZE, core, 0)).collect();
     let end = server.post("/v1/images/a/tiles", &body).lines().pop().unwrap();
     assert_eq!((&end["tiles"], &end["errors"]), (&json!(28), &json!(0)));
-    wait_for("all others", || server.get("/v1/images/a").json()["regions_open"] == 1);
-    wait_for("the trouble to show", || server.get("/v1/images/a").json()["trouble"].is_object());
-    wait_for("the region to be set aside", || state(&server, early) == "too_large");
+    wait_until("all others", || server.get("/v1/images/a").json()["regions_open"] == 1);
+    wait_until("the trouble to show", || server.get("/v1/images/a").json()["trouble"].is_object());
+    wait_until("the region to be set aside", || state(&server, early) == "too_large");
     let trouble = server.get("/v1/images/a").json()["trouble"].clone();
     assert_eq!(trouble["code"], "over_memory", "{trouble}");
     let refused = server.get("/v1/images/a/result.exr").problem(409, "image_incomplete");

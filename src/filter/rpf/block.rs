@@ -26,33 +26,26 @@ trait Part {
     fn values_mut(&mut self) -> &mut [f32];
 }
 
-impl Part for Line {
-    const COLUMNS: usize = LANES;
+macro_rules! parts {
+    ($($part:ty: $columns:expr),*) => {$(
+        impl Part for $part {
+            const COLUMNS: usize = $columns;
 
-    #[inline(always)]
-    fn values(&self) -> &[f32] {
-        &self.0
-    }
+            #[inline(always)]
+            fn values(&self) -> &[f32] {
+                &self.0
+            }
 
-    #[inline(always)]
-    fn values_mut(&mut self) -> &mut [f32] {
-        &mut self.0
-    }
+            #[inline(always)]
+            fn values_mut(&mut self) -> &mut [f32] {
+                &mut self.0
+            }
+        }
+    )*};
 }
 
-impl Part for HalfLine {
-    const COLUMNS: usize = HALF;
-
-    #[inline(always)]
-    fn values(&self) -> &[f32] {
-        &self.0
-    }
-
-    #[inline(always)]
-    fn values_mut(&mut self) -> &mut [f32] {
-        &mut self.0
-    }
-}
+// Two types, since an alignment cannot be a parameter of one.
+parts!(Line: LANES, HalfLine: HALF);
 
 /// Columns of a neighbourhood, by role. Features fill whole lines, since they are tested line by line; positions and
 /// random parameters together fill whole halves of lines.
