@@ -17,6 +17,8 @@ pub(crate) struct Cluster {
     /// Deviations allowed to each feature.
     deviations: Vec<[f64; LANES]>,
     floor: f64,
+    /// Of each line a bit for each feature that any sample lacks.
+    lacked: Vec<u64>,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -35,12 +37,16 @@ impl Cluster {
         for (place, feature) in deviations.as_flattened_mut().iter_mut().zip(features) {
             *place = if feature.position { params.position_threshold } else { params.feature_threshold };
         }
-        Self { lines: vec![Interval::default(); lines], deviations, floor: params.threshold_floor }
+        let mut lacked = vec![0; lines];
+        for (index, _) in features.iter().enumerate().filter(|(_, feature)| feature.may_miss) {
+            lacked[index / LANES] |= 1 << (index % LANES);
+        }
+        Self { lines: vec![Interval::default(); lines], deviations, floor: params.threshold_floor, lacked }
     }
 
     /// Bytes that [`Cluster::new`] allocates.
     pub(crate) const fn bytes(features: usize) -> u64 {
-        (features.div_ceil(LANES) * (size_of::<Interval>() + size_of::<[f64; LANES]>())) as u64
+        (features.div_ceil(LANES) * (size_of::<Interval>() + size_of::<[f64; LANES]>() + size_of::<u64>())) as u64
     }
 
     /// Sets the intervals from a pixel's own samples.
@@ -57,11 +63,20 @@ impl Cluster {
     #[inline(always)]
     pub(crate) fn keep<S: Simd>(&self, simd: S, block: &Block, records: &mut [u32]) -> usize {
         let mut kept = records.len();
-        for (line, interval) in self.lines.iter().enumerate() {
-            let bounds = Bounds::of(simd, interval);
-            kept = match interval.missing {
-                0 => bounds.keep(simd, block, line, &mut records[..kept], false),
-                _ => bounds.keep(simd, block, line, &mut records[..kept], true),
+        for (line, (interval, lacked)) in self.lines.iter().zip(&self.lacked).enumerate() {
+            let (bounds, records) = (Bounds::of(simd, interval), &mut records[..kept]);
+            let missing = match (interval.missing, lacked & !interval.missing) {
+                (0, _) => Missing::Nowhere,
+                (_, 0) => Missing::Anywhere,
+                _ => Missing::Somewhere,
+            };
+            kept = match (block.feature_lines(), missing) {
+                // Most scenes have one line.
+                (1, Missing::Nowhere) => bounds.keep::<1>(simd, block, line, records, Missing::Nowhere),
+                (1, Missing::Anywhere) => bounds.keep::<1>(simd, block, line, records, Missing::Anywhere),
+                (_, Missing::Nowhere) => bounds.keep::<0>(simd, block, line, records, Missing::Nowhere),
+                (_, Missing::Anywhere) => bounds.keep::<0>(simd, block, line, records, Missing::Anywhere),
+                (_, Missing::Somewhere) => bounds.keep::<0>(simd, block, line, records, Missing::Somewhere),
             };
         }
         kept
@@ -130,26 +145,49 @@ impl<S: Simd> Bounds<S> {
     }
 
     /// Moves those of some records forward, in order, of which a line of features is inside; says how many they are.
+    /// `LINES` are those of a record, or 0 if only the block knows.
     #[inline(always)]
-    fn keep(&self, simd: S, block: &Block, line: usize, records: &mut [u32], may_miss: bool) -> usize {
-        let (features, lines) = (block.features(), block.feature_lines());
+    fn keep<const LINES: usize>(
+        &self,
+        simd: S,
+        block: &Block,
+        line: usize,
+        records: &mut [u32],
+        missing: Missing,
+    ) -> usize {
+        let (features, lines) = (block.features(), if LINES > 0 { LINES } else { block.feature_lines() });
         let mut kept = 0;
         // No branch on what is inside: it could not be foretold.
         for index in 0..records.len() {
             let record = records[index];
             records[kept] = record;
             let values = Lanes::from_slice(simd, &features[record as usize * lines + line].0);
-            kept += usize::from(self.hold(values, may_miss));
+            kept += usize::from(self.hold(values, missing));
         }
         kept
     }
 
-    /// Whether 16 features are inside, or, if any `may_miss`, missing where they may be.
+    /// Whether 16 features are inside, or missing where they may be.
     #[inline(always)]
-    fn hold(&self, values: Lanes<S>, may_miss: bool) -> bool {
-        let inside = values.simd_ge(self.low) & values.simd_le(self.high);
-        if may_miss { (inside | !values.simd_eq(values) & self.missing).all_true() } else { inside.all_true() }
+    fn hold(&self, values: Lanes<S>, missing: Missing) -> bool {
+        // A missing value is neither inside nor outside.
+        let outside = values.simd_lt(self.low) | values.simd_gt(self.high);
+        match missing {
+            Missing::Nowhere => (values.simd_ge(self.low) & values.simd_le(self.high)).all_true(),
+            Missing::Anywhere => !outside.any_true(),
+            Missing::Somewhere => !(outside | !values.simd_eq(values) & !self.missing).any_true(),
+        }
     }
+}
+
+/// Which features of a candidate may be missing.
+#[derive(Clone, Copy, Debug)]
+enum Missing {
+    Nowhere,
+    /// Those that the interval says.
+    Somewhere,
+    /// All that are missing in any record.
+    Anywhere,
 }
 
 /// A bit for each lane.

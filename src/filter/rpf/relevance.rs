@@ -25,6 +25,8 @@ pub(crate) struct Feature {
     pub(crate) plane: usize,
     /// Whether it is a world position.
     pub(crate) position: bool,
+    /// Whether any sample has none.
+    pub(crate) may_miss: bool,
 }
 
 /// The planes that matter, by role.
@@ -68,7 +70,10 @@ impl Relevant {
                         found.left_out.push(LeftOut { plane: tile.channels().plane_name(plane), reason });
                     }
                 }
-                Role::Feature { position } => found.features.push(Feature { plane, position }),
+                Role::Feature { position } => {
+                    let may_miss = misses_any(tile.plane(plane));
+                    found.features.push(Feature { plane, position, may_miss });
+                }
                 Role::Random { .. } => found.random.push(plane),
             }
         }
@@ -105,6 +110,17 @@ impl Relevant {
             random: self.random.len() as u64,
             features: self.features.len() as u64,
             colors: self.twins.iter().enumerate().filter(|(channel, twin)| channel == *twin).count() as u64,
+        }
+    }
+}
+
+/// Whether any value of a plane is missing.
+fn misses_any(plane: &Plane) -> bool {
+    match plane {
+        Plane::Constant(value) => value.is_nan(),
+        // Some at a time, all of them, so that the compiler puts them into lanes.
+        Plane::Values(values) => {
+            values.chunks(64).any(|some| some.iter().fold(false, |missing, value| missing | value.is_nan()))
         }
     }
 }
