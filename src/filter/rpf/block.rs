@@ -259,33 +259,33 @@ fn copy_row<S: Simd, P: Part>(
         Source::Plane(plane) => tile.plane(plane),
         Source::CenterX | Source::CenterY => &Plane::Constant(0.0),
     });
+    let total = samples.len();
+    let records = &mut records[first * parts..(first + total) * parts];
     for part in 0..parts {
-        let mut planes = [&Plane::Constant(0.0); LANES];
-        planes[..P::COLUMNS].iter_mut().zip(&mut sources).for_each(|(place, plane)| *place = plane);
-        for start in samples.clone().step_by(HALF) {
-            let count = HALF.min(samples.end - start);
-            for column in (0..P::COLUMNS).step_by(HALF) {
+        for column in (0..P::COLUMNS).step_by(HALF) {
+            let planes = [(); HALF].map(|()| sources.next().unwrap_or(&Plane::Constant(0.0)));
+            // Eight samples of each plane at a time; what is left at the end, and what is constant, is in copies.
+            let (mut copies, whole) = ([[0.0; HALF]; HALF], total - total % HALF);
+            let mut runs = [&[][..]; HALF];
+            for k in 0..HALF {
+                match planes[k] {
+                    Plane::Values(values) => {
+                        runs[k] = values[samples.start..samples.start + whole].as_chunks().0;
+                        copies[k][..total - whole].copy_from_slice(&values[samples.start + whole..samples.end]);
+                    }
+                    Plane::Constant(value) => copies[k] = [*value; HALF],
+                }
+            }
+            let groups = records.chunks_mut(HALF * parts);
+            for (group, records) in groups.enumerate() {
                 let mut values = [[Quarter::splat(simd, 0.0); HALF]; 2];
-                for (k, plane) in planes[column..column + HALF].iter().enumerate() {
-                    let mut few = [0.0; HALF];
-                    let run = match plane {
-                        Plane::Constant(value) => {
-                            (values[0][k], values[1][k]) = (Quarter::splat(simd, *value), Quarter::splat(simd, *value));
-                            continue;
-                        }
-                        Plane::Values(values) if count == HALF => &values[start..start + HALF],
-                        Plane::Values(values) => {
-                            few[..count].copy_from_slice(&values[start..start + count]);
-                            &few
-                        }
-                    };
+                for k in 0..HALF {
+                    let run = runs[k].get(group).unwrap_or(&copies[k]);
                     values[0][k] = Quarter::from_slice(simd, &run[..QUARTER]);
                     values[1][k] = Quarter::from_slice(simd, &run[QUARTER..]);
                 }
-                let [first_half, second_half] = values;
-                let values = [transpose(first_half), transpose(second_half)];
-                let place = records[(first + start - samples.start) * parts + part..].iter_mut().step_by(parts);
-                for (record, value) in place.zip(&values.as_flattened()[..count]) {
+                let values = [transpose(values[0]), transpose(values[1])];
+                for (record, value) in records[part..].iter_mut().step_by(parts).zip(values.as_flattened()) {
                     value.store_slice(&mut record.values_mut()[column..column + HALF]);
                 }
             }
