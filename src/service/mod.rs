@@ -11,6 +11,7 @@ pub mod auth;
 mod body;
 mod charge;
 mod connection;
+mod entry;
 mod health;
 mod images;
 mod inflate;

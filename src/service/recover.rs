@@ -17,10 +17,11 @@ use serde_json::Value;
 
 use super::{
     Shared,
+    entry::{Entry, Id, Opened, Slot},
     health::{Reason, recovering},
     problem::Refusal,
     regions,
-    registry::{Entry, Id, Images, Opened, Slot, now, remove},
+    registry::{Images, now, remove},
     work::blocking,
 };
 use crate::{

@@ -27,12 +27,12 @@ use super::{
     Shared,
     body::Frames,
     charge::{Charge, keep},
+    entry::{Id, Opened},
     metrics::Phase,
     picture::{CorePixels, encode_png, write_file},
     problem::{Refusal, corners, internal},
     query::{Form, Parameters, attributes},
     receive::{Fault, Received, Receiver},
-    registry::{Id, Opened},
     results::{AROUND, Results, file_response},
     work::{blocking, stopped},
 };
