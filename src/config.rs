@@ -17,8 +17,18 @@ use std::{
 use value::Value;
 pub use value::{ByteSize, LogFormat, SizeError};
 
-/// Least memory that makes a service: 1 MiB.
-pub const MIN_MEMORY: u64 = 1 << 20;
+/// Least memory that makes a service: 4 MiB. A small image can be open then, three requests be under way, and a tile of
+/// 16 x 16 pixels with a sample each be filtered by the default preset, with its halo.
+pub const MIN_MEMORY: u64 = 4 << 20;
+/// The same for each thread, beyond 8 of them.
+pub const THREAD_MEMORY: u64 = 512 << 10;
+/// Connections that cost nothing of the memory: what comes over them before a request has its own is in what the service
+/// takes beside.
+pub const FREE_CONNECTIONS: usize = 512;
+/// Memory for each connection more: the head of a request, or what was read of the next one, and its state.
+pub const CONNECTION_MEMORY: u64 = 96 << 10;
+/// Least disk, for images and for results: 1 MiB.
+pub const MIN_DISK: u64 = 1 << 20;
 /// Most memory that is counted: 4 TiB less 1 KiB.
 pub const MAX_MEMORY: u64 = (1 << 42) - 1024;
 /// Most threads.
@@ -112,9 +122,9 @@ settings! {
 
     /// Memory for tiles at work (samples, the filter's buffers, results) and, a share of it (a quarter up to 64 MiB, then
     /// an eighth), for requests, and of that, a quarter, for the counts of tiles that vary in them; and half as much as that
-    /// share for what is known of images. 1MiB to 4TiB less 1KiB
+    /// share for what is known of images. 4MiB, and half a MiB a thread, to 4TiB less 1KiB
     memory: ByteSize = ByteSize(1 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_MEMORY).contains(&size.0),
-        "must be 1MiB to 4TiB less 1KiB";
+        "must be 4MiB to 4TiB less 1KiB";
 
     /// Free space of the data folder's file system below which the service says that it is not ready. 4KiB at least
     disk_reserve: ByteSize = ByteSize(256 << 20), "SIZE", |size| size.0 >= 4096, "must be 4KiB at least";
@@ -127,8 +137,8 @@ settings! {
     /// its levels, like sse4.2 or avx2
     simd: SimdLevel = SimdLevel::default(), "LEVEL", |_| true, "";
 
-    /// Connections at once; more wait to be accepted. 1 to 65536
-    connections: usize = 1024, "N", count, "must be 1 to 65536";
+    /// Connections at once; more wait to be accepted. Beyond 512 each takes 96KiB of the memory. 1 to 65536
+    connections: usize = 512, "N", count, "must be 1 to 65536";
 
     /// Requests at once on one HTTP/2 connection; more wait at the client. 1 to 1000
     streams: u32 = 32, "N", |n| (1..=1000).contains(n), "must be 1 to 1000";
@@ -146,7 +156,7 @@ settings! {
     token_images: usize = 256, "N", count, "must be 1 to 65536";
 
     /// Disk for all images; what one takes at worst is set aside when it is opened. 1MiB to 1EiB
-    disk: ByteSize = ByteSize(64 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_DISK).contains(&size.0),
+    disk: ByteSize = ByteSize(64 << 30), "SIZE", |size| (MIN_DISK..=MAX_DISK).contains(&size.0),
         "must be 1MiB to 1EiB";
 
     /// How long an image is kept that nobody uses. A second to ten years
@@ -163,7 +173,7 @@ settings! {
     queue: usize = 1024, "N", count, "must be 1 to 65536";
 
     /// Disk for results and other answers that nobody has read yet, of all requests. 1MiB to 4TiB less 1KiB
-    unread_results: ByteSize = ByteSize(4 << 30), "SIZE", |size| (MIN_MEMORY..=MAX_MEMORY).contains(&size.0),
+    unread_results: ByteSize = ByteSize(4 << 30), "SIZE", |size| (MIN_DISK..=MAX_MEMORY).contains(&size.0),
         "must be 1MiB to 4TiB less 1KiB";
 
     /// Bytes a second that a client must bring, or take, over each idle_deadline that it is waited for. 1B to 1GiB
@@ -205,18 +215,42 @@ impl Config {
         if wrong.is_empty() { Ok(()) } else { Err(ConfigError(wrong)) }
     }
 
+    /// Bytes of memory that connections take beside those that are free.
+    fn connection_memory(&self) -> u64 {
+        CONNECTION_MEMORY * self.connections.saturating_sub(FREE_CONNECTIONS) as u64
+    }
+
+    /// Bytes of memory for tiles, requests and images.
+    pub(crate) fn shared_memory(&self) -> u64 {
+        self.memory.0.saturating_sub(self.connection_memory())
+    }
+
     /// What is wrong with each setting, which goes by the name that `named` gives it.
     fn faults(&self, named: impl Fn(&Setting) -> String) -> Vec<String> {
         let shown = |setting: &Setting| (setting.to_toml)(self).unwrap_or_else(|| "unset".to_owned());
         let one =
             |setting: &&Setting| Some(format!("{} = {}: {}", named(setting), shown(setting), (setting.check)(self)?));
         let mut wrong: Vec<String> = SETTINGS.iter().filter_map(|setting| one(&setting)).collect();
-        if !self.listen.ip().to_canonical().is_loopback() && self.token_file.is_none() && !self.insecure_no_auth {
-            let name = SETTINGS.iter().find(|setting| setting.name == "listen").map(&named).unwrap_or_default();
+        let name = |name| SETTINGS.iter().find(|setting| setting.name == name).map(&named).unwrap_or_default();
+        let least = MIN_MEMORY.max(THREAD_MEMORY.saturating_mul(self.threads as u64)) + self.connection_memory();
+        // Else the one that is wrong has been told of.
+        let fine = self.memory.0 >= MIN_MEMORY && self.threads <= MAX_THREADS && self.connections <= MAX_COUNT;
+        if fine && self.memory.0 < least {
             wrong.push(format!(
-                "{name} = \"{}\": whoever reaches this address could use the service, as no tokens are set. Set token_file \
+                "{} = \"{}\": with {} threads and {} connections must be {} at least",
+                name("memory"),
+                self.memory,
+                self.threads,
+                self.connections,
+                ByteSize(least)
+            ));
+        }
+        if !self.listen.ip().to_canonical().is_loopback() && self.token_file.is_none() && !self.insecure_no_auth {
+            wrong.push(format!(
+                "{} = \"{}\": whoever reaches this address could use the service, as no tokens are set. Set token_file \
                  (rpfd token makes its entries), or listen on loopback (127.0.0.1 or [::1]) behind a proxy; \
                  insecure_no_auth = true serves without tokens all the same",
+                name("listen"),
                 self.listen
             ));
         }
@@ -280,11 +314,22 @@ mod tests {
             config.validate().is_ok()
         };
         let second = Duration::from_secs(1);
-        assert!(with(&|c| c.memory.0 = MIN_MEMORY) && !with(&|c| c.memory.0 = MIN_MEMORY - 1));
+        let memory = |bytes, threads, connections| {
+            with(&|c| (c.memory.0, c.threads, c.connections) = (bytes, threads, connections))
+        };
+        assert!(memory(MIN_MEMORY, 8, FREE_CONNECTIONS) && !memory(MIN_MEMORY - 1, 1, 1));
+        assert!(memory(9 * THREAD_MEMORY, 9, 1) && !memory(9 * THREAD_MEMORY - 1, 9, 1));
+        let more = MIN_MEMORY + 3 * CONNECTION_MEMORY;
+        assert!(memory(more, 1, FREE_CONNECTIONS + 3) && !memory(more - 1, 1, FREE_CONNECTIONS + 3));
+        assert_eq!(
+            Config { memory: ByteSize(more), connections: 515, ..Config::default() }.shared_memory(),
+            MIN_MEMORY
+        );
         assert!(with(&|c| c.memory.0 = MAX_MEMORY) && !with(&|c| c.memory.0 = MAX_MEMORY + 1));
         assert!(with(&|c| c.threads = MAX_THREADS) && !with(&|c| c.threads = MAX_THREADS + 1));
         assert!(with(&|c| c.idle_deadline = MAX_DEADLINE) && !with(&|c| c.idle_deadline = MAX_DEADLINE + second));
-        assert!(with(&|c| c.connections = MAX_COUNT) && !with(&|c| c.connections = MAX_COUNT + 1));
+        let connections = |n| with(&|c| (c.memory.0, c.connections) = (8 << 30, n));
+        assert!(connections(MAX_COUNT) && !connections(MAX_COUNT + 1));
         assert!(with(&|c| c.requests = MAX_COUNT) && !with(&|c| c.requests = MAX_COUNT + 1));
         assert!(with(&|c| c.token_requests = MAX_COUNT) && !with(&|c| c.token_requests = MAX_COUNT + 1));
         assert!(with(&|c| c.streams = 1000) && !with(&|c| c.streams = 1001));
@@ -296,7 +341,7 @@ mod tests {
         assert!(with(&|c| c.queue = MAX_COUNT) && !with(&|c| c.queue = MAX_COUNT + 1));
         assert!(with(&|c| c.work_deadline = MAX_DEADLINE) && !with(&|c| c.work_deadline = MAX_DEADLINE + second));
         assert!(with(&|c| c.min_rate.0 = 1 << 30) && !with(&|c| c.min_rate.0 = (1 << 30) + 1));
-        assert!(with(&|c| c.unread_results.0 = MIN_MEMORY) && !with(&|c| c.unread_results.0 = MIN_MEMORY - 1));
+        assert!(with(&|c| c.unread_results.0 = MIN_DISK) && !with(&|c| c.unread_results.0 = MIN_DISK - 1));
         assert!(with(&|c| c.images = 1) && !with(&|c| c.images = MAX_COUNT + 1));
         assert!(with(&|c| c.token_images = 1) && !with(&|c| c.token_images = MAX_COUNT + 1));
     }

@@ -270,7 +270,7 @@ mod tests {
             ("listen", "[::1]:9"),
             ("metrics_listen", "127.0.0.1:0"),
             ("token_file", "/a \"b\"\\\n/ü"),
-            ("memory", "1048577"),
+            ("memory", "1073741825"),
             ("queue_deadline", "0.0000012"),
             ("log_format", "json"),
         ]);

@@ -19,6 +19,8 @@ mod jobs;
 mod neighbors;
 mod record;
 pub mod regions;
+mod result;
+mod room;
 
 pub use announced::keeping;
 pub use description::{Announced, Description, disk_bytes};
@@ -30,7 +32,6 @@ pub use regions::{RegionState, Regions};
 use std::{
     collections::HashMap,
     convert::Infallible,
-    fs::File,
     io,
     path::Path,
     sync::{
@@ -43,8 +44,8 @@ use crate::{
     disk::Folder,
     filter::{ChannelSet, Filtered, Rect, SampleTile, Stopped},
     stitch::{
-        Added, Canvas, CanvasError, Claim, Digest, ExrOptions, Offer, Pixels, StitchError, Stitcher, Verdict,
-        canvas::Checksum, digest::digest,
+        Added, Canvas, CanvasError, Claim, Digest, Offer, Pixels, StitchError, Stitcher, Verdict, canvas::Checksum,
+        digest::digest,
     },
     store::{Change, Records, State, StateError, samples, state},
 };
@@ -485,33 +486,4 @@ impl Image {
         }
         Ok(())
     }
-
-    /// The result that was written down with these options, if it is that of the image as it is.
-    pub fn result(&self, options: &ExrOptions) -> Option<File> {
-        let inner = self.read();
-        let known = inner.result.as_deref() == Some(&key(options));
-        known.then(|| File::open(self.folder().join(RESULT)).ok()).flatten()
-    }
-
-    /// Removes the result that was written down, if there is one.
-    pub fn forget_result(&self) {
-        self.write().forget_result(&*self.folder);
-    }
-
-    /// Keeps a file as the result with these options, until the image changes or another one is kept. It was written in
-    /// the image's folder when there had been so many [replacements](Inner::replacements): if there were more, it is none.
-    pub fn keep_result(&self, file: tempfile::NamedTempFile, options: &ExrOptions, replacements: u64) -> bool {
-        let mut inner = self.write();
-        let current = inner.replacements == replacements;
-        if current {
-            inner.result = None;
-            // Without it, the result is written anew each time.
-            inner.result = file.persist(self.folder().join(RESULT)).is_ok().then(|| key(options));
-        }
-        current
-    }
-}
-
-fn key(options: &ExrOptions) -> String {
-    format!("{options:?}")
 }

@@ -1,7 +1,7 @@
 //! Images whose tiles lend each other their halos: the samples are kept until all regions that read them are filtered.
 //!
 //! Of a pixel its core has the last word. Until that has come, what a halo brings stands for it, so that regions need not
-//! wait; such pixels are kept once, as far as there is [room](sample_bytes) beside all cores that may still come. What was
+//! wait; such pixels are kept once, as far as there is [room](Room) beside all cores that may still come. What was
 //! filtered from them is *provisional*: when the cores have come their samples are compared with what was read then, and
 //! only if they differ it is filtered again.
 
@@ -10,9 +10,9 @@ use std::{collections::BTreeMap, sync::Arc};
 use super::{
     After, Announced, Description, Image, ImageError, MAX_TILES, Outcome, RegionState, Regions,
     announced::small,
-    description::{most_cores, sample_bytes},
     jobs::unfiltered,
     record::{CoreRecord, extent_from_bytes, extent_to_bytes},
+    room::Room,
 };
 use crate::{
     disk::Folder,
@@ -55,49 +55,6 @@ struct Lent {
     /// None while it is being written.
     extent: Option<Extent>,
     counted: bool,
-}
-
-/// Disk for samples.
-#[derive(Debug)]
-struct Room {
-    /// Bytes that were set aside.
-    all: u64,
-    /// Bytes that are taken.
-    taken: u64,
-    announced: Announced,
-    /// Cores that may come in all, and pixels.
-    cores: u64,
-    pixels: u64,
-}
-
-impl Room {
-    fn new(description: &Description, announced: &Announced) -> Self {
-        let [width, height] = description.size.map(u64::from);
-        Self {
-            all: sample_bytes(description),
-            taken: 0,
-            announced: announced.clone(),
-            cores: most_cores(description.size),
-            pixels: width * height,
-        }
-    }
-
-    /// Takes room for some pixels that a halo brings, if there is any beside what is owed to the cores that are still to
-    /// come, after so many with so many pixels.
-    fn lend(&mut self, part: &Rect, cores: usize, pixels: u64) -> bool {
-        let owed = self.announced.room(self.cores.saturating_sub(cores as u64), self.pixels.saturating_sub(pixels));
-        let wanted = self.announced.room(1, part.area());
-        let fits =
-            self.taken.checked_add(wanted).and_then(|sum| sum.checked_add(owed)).is_some_and(|sum| sum <= self.all);
-        self.taken += if fits { wanted } else { 0 };
-        fits
-    }
-
-    /// Gives back what was taken for pixels that are not kept, or takes less, now that it is known.
-    fn settle(&mut self, part: &Rect, extent: Option<&Extent>) {
-        self.taken -= self.announced.room(1, part.area());
-        self.taken += extent.map_or(0, Extent::room);
-    }
 }
 
 impl Neighbors {
@@ -474,66 +431,5 @@ impl Image {
         let after = lent.iter().map(|(part, _)| After::Lent(*part)).chain([After::Arrived(core)]);
         inner.queue(changes, after);
         Ok(Outcome::Stored)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::{
-        disk::Directory,
-        filter::{Channel, ChannelSet, Counts, Method, Plane, Role},
-        image::disk_bytes,
-    };
-
-    /// Whatever halos take, all cores that may still come have room, at their worst; and a quarter of the pixels is lent.
-    #[test]
-    fn halos_leave_room_for_all_cores() {
-        let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
-        let announced = Announced { channels, samples: 3, varying: true, region: 64 };
-        let method = Method::preset("lean").unwrap();
-        let neighbors = Some(announced.clone());
-        let description =
-            Description { size: [1024, 768], method, seed: 0, leave_out: true, neighbors, owner: None, disk: 0 };
-        let description = Description { disk: disk_bytes(&description), ..description };
-        let mut room = Room::new(&description, &announced);
-        let (most, pixels) = (most_cores(description.size), 1024 * 768);
-        assert_eq!((room.cores, room.pixels), (most, pixels));
-        // What the noisiest core of 16 x 16 takes: planes of random bits.
-        let mut state = 1u64;
-        let mut value = || {
-            state ^= state << 13;
-            state ^= state >> 7;
-            state ^= state << 17;
-            f32::from_bits((state >> 32) as u32 & 0xFF7F_FFFF)
-        };
-        let geometry = TileGeometry::with_halo(description.size, Rect::new(0, 0, 16, 16), 0).unwrap();
-        let planes = (0..3).map(|_| Plane::Values((0..768).map(|_| value()).collect())).collect();
-        let tile =
-            SampleTile::new(geometry, announced.channels.clone(), Counts::Varying(vec![3; 256]), planes).unwrap();
-        let folder = tempfile::tempdir().unwrap();
-        let file = SampleFile::create(&Directory::new(folder.path()), announced.channels.clone()).unwrap();
-        let core = file.append(&tile, &geometry.core()).unwrap().room();
-        assert!((9216..=announced.room(1, 256)).contains(&core), "{core}");
-        let (mut cores, mut brought, mut lent) = (0, 0, 0);
-        while brought < pixels {
-            // Strips as wide as a tile, until there is no room; then a core of 16 x 16.
-            let strip = Rect::new(0, 0, 64, 17);
-            while room.lend(&strip, cores, brought) {
-                lent += strip.area();
-            }
-            assert!(lent >= pixels / 4, "{lent}");
-            assert!(room.taken + announced.room(most - cores as u64, pixels - brought) <= room.all);
-            room.taken += core;
-            (cores, brought) = (cores + 1, brought + 256);
-        }
-        assert!(room.taken <= room.all);
-        // What is not kept is free again.
-        let (before, part) = (room.taken, Rect::new(0, 0, 1, 1));
-        room.all += 1 << 20;
-        assert!(room.lend(&part, cores, brought));
-        room.settle(&part, None);
-        assert_eq!(room.taken, before);
-        assert!(!Room { all: 0, ..room }.lend(&part, 0, 0));
     }
 }

@@ -13,7 +13,7 @@ use std::{
 use axum::{
     body::{Body, Bytes, HttpBody},
     extract::{FromRequestParts, Request, State},
-    http::{header, request::Parts},
+    http::{Version, header, request::Parts},
     middleware::Next,
     response::Response,
 };
@@ -21,6 +21,7 @@ use http_body::{Frame, SizeHint};
 
 use super::{
     Shared,
+    connection::BUFFER,
     inflate::OVERHEAD,
     problem::{Refusal, internal},
 };
@@ -30,6 +31,18 @@ use crate::admission::{AdmissionError, Budget, Permit};
 pub(super) const REQUEST: u64 = 256 << 10;
 /// The window that is taken from the start for a body in zstd: that of its default level.
 const WINDOW: u64 = 2 << 20;
+
+/// Bytes that came of requests over HTTP/2 and that are not charged yet, of all together: beside the memory, like
+/// connections. Over HTTP/1.1 they are the connection's.
+pub(super) const AHEAD: u64 = 8 << 20;
+/// What a field of a head takes beside its name and value.
+const FIELD: usize = 256;
+
+/// What came of a request before it is charged: its head, and as much of its body as a client may send at once.
+fn ahead(request: &Request) -> u64 {
+    let fields = request.headers().iter().map(|(name, value)| name.as_str().len() + value.len() + FIELD);
+    (fields.sum::<usize>() + request.uri().path().len() + BUFFER as usize) as u64
+}
 
 /// What of so much memory is for tiles, for requests, for the counts of tiles that vary in them, and for what is known of
 /// images. Requests have a quarter up to 64 MiB, then an eighth; of that, a quarter is for counts. Images have half of
@@ -45,6 +58,8 @@ pub(super) fn shares(memory: u64) -> [u64; 4] {
 pub(super) struct Charge {
     permit: Arc<Mutex<Permit>>,
     budget: Budget,
+    /// Over HTTP/2, for what came while it holds nothing.
+    ahead: Option<Budget>,
     deadline: Duration,
 }
 
@@ -52,7 +67,7 @@ impl Charge {
     /// So many bytes of this budget, when their turn comes.
     pub(super) async fn new(budget: &Budget, bytes: u64, deadline: Duration) -> Result<Self, AdmissionError> {
         let permit = budget.reserve(bytes, deadline).await?;
-        Ok(Self { permit: Arc::new(Mutex::new(permit)), budget: budget.clone(), deadline })
+        Ok(Self { permit: Arc::new(Mutex::new(permit)), budget: budget.clone(), ahead: None, deadline })
     }
 
     fn permit(&self) -> MutexGuard<'_, Permit> {
@@ -83,6 +98,10 @@ impl Charge {
         let grown = self.permit().grow_to(bytes);
         let taken = match grown {
             Err(AdmissionError::Busy { .. }) => {
+                let _ahead = match &self.ahead {
+                    Some(ahead) => Some(ahead.reserve(BUFFER.into(), Duration::ZERO).await.map_err(for_window)?),
+                    None => None,
+                };
                 self.permit().shrink_to(0);
                 self.budget.reserve(bytes, self.deadline).await.map(|permit| *self.permit() = permit)
             }
@@ -107,7 +126,11 @@ pub(super) async fn charge(
     let packed = request.headers().contains_key(header::CONTENT_ENCODING);
     let wanted = REQUEST + if packed { OVERHEAD + WINDOW } else { 0 };
     let wanted = wanted.min(service.requests.total());
-    let charge = Charge::new(&service.requests, wanted, service.config.queue_deadline).await?;
+    let two = request.version() == Version::HTTP_2;
+    let came = service.ahead.reserve(if two { ahead(&request) } else { 0 }, Duration::ZERO).await?;
+    let mut charge = Charge::new(&service.requests, wanted, service.config.queue_deadline).await?;
+    drop(came);
+    charge.ahead = two.then(|| service.ahead.clone());
     request.extensions_mut().insert(charge.clone());
     let response = next.run(request).await;
     Ok(response.map(|body| keep(body, charge)))
@@ -148,5 +171,47 @@ impl<S: Sync> FromRequestParts<S> for Charge {
 
     async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Refusal> {
         parts.extensions.get().cloned().ok_or_else(|| internal("a request without a charge").into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        config::{Config, MIN_MEMORY, THREAD_MEMORY},
+        filter::{
+            Channel, ChannelSet, Method, Rect, Role, TileGeometry,
+            plan::{Shape, plan},
+        },
+        image::{Announced, Description, INDEX_STEP},
+    };
+
+    #[test]
+    fn the_least_memory_makes_a_service() {
+        let (method, size) = (Method::default(), [128, 128]);
+        let channel = |name: &str, role, components| Channel::new(name, role, components);
+        let channels = ChannelSet::new(vec![
+            channel("color", Role::Color, 3),
+            channel("P", Role::Feature { position: true }, 3),
+            channel("N", Role::Feature { position: false }, 3),
+            channel("albedo", Role::Feature { position: false }, 3),
+            channel("lens", Role::Random { uniform: true }, 2),
+        ])
+        .unwrap();
+        let geometry = TileGeometry::with_halo(size, Rect::new(56, 56, 16, 16), method.reach(false)).unwrap();
+        let samples = geometry.window().area();
+        let shape = Shape { geometry: &geometry, channels: &channels, samples, max_per_pixel: 1, varying: false };
+        for threads in [1, 2, 8, 9, 64, 1024] {
+            let [tiles, requests, _, images] = shares(MIN_MEMORY.max(THREAD_MEMORY * threads as u64));
+            let needed = plan(&shape, &method).total(threads);
+            assert!(needed <= tiles, "{threads} threads: {needed} of {tiles} bytes");
+            assert!(3 * REQUEST <= requests);
+            let neighbors = Announced { channels: channels.clone(), samples: 1, varying: false, region: 16 };
+            let (method, owner) = (method.clone(), None);
+            let (seed, leave_out, neighbors, disk) = (0, true, Some(neighbors), 0);
+            let description = Description { size, method, seed, leave_out, neighbors, owner, disk };
+            assert!(description.index_bytes() + INDEX_STEP <= images);
+        }
+        assert_eq!(shares(Config::default().memory.0).iter().sum::<u64>(), Config::default().memory.0);
     }
 }

@@ -2,7 +2,7 @@
 
 use std::{convert::Infallible, io, pin::pin, sync::Arc, time::Duration};
 
-use axum::{Extension, Router};
+use axum::{Extension, Router, http::StatusCode, response::IntoResponse};
 use hyper::{
     Request,
     body::Incoming,
@@ -25,7 +25,9 @@ use super::pace::{OpenBodies, Pace, Taken, Watched};
 /// What an HTTP/2 client sends first.
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 /// Bytes that a connection over HTTP/1.1, or a stream over HTTP/2, reads ahead; the head of a request is no longer.
-const BUFFER: u32 = 64 << 10;
+pub(super) const BUFFER: u32 = 64 << 10;
+/// Most fields of the head of a request; over HTTP/1.1 hyper sees to it.
+const FIELDS: usize = 100;
 /// Most bytes of the answers of one HTTP/2 stream that wait to be sent: with [`BUFFER`] within a request's charge.
 const SEND_BUFFER: usize = 128 << 10;
 
@@ -136,12 +138,20 @@ async fn serve_2(
     let (active, streams) = watch::channel(0);
     let router = TowerToHyperService::new(router);
     let service = service_fn(move |mut request: Request<Incoming>| {
+        // Before anything is kept of it.
+        let many = request.headers().len() > FIELDS;
         let bodies = OpenBodies::default();
         request.extensions_mut().insert(Stream::new(&active));
         request.extensions_mut().insert(bodies.clone());
-        let answered = router.call(request);
+        let answered = if many { Err(StatusCode::REQUEST_HEADER_FIELDS_TOO_LARGE) } else { Ok(router.call(request)) };
         // What is written to the connection does not tell who takes his answer and who does not.
-        async move { Ok::<_, Infallible>(answered.await?.map(|body| Taken::new(body, limits.pace, bodies))) }
+        async move {
+            let answer = match answered {
+                Ok(answer) => answer.await?,
+                Err(status) => status.into_response(),
+            };
+            Ok::<_, Infallible>(answer.map(|body| Taken::new(body, limits.pace, bodies)))
+        }
     });
     let connection = http2::Builder::new(TokioExecutor::new())
         .timer(TokioTimer::new())

@@ -23,11 +23,11 @@ use super::{
     auth::Owner,
     body::Frames,
     charge::Charge,
+    entry::{Id, Opened, Reading, no_image},
     picture::{encode_png, write_file},
     problem::{Refusal, corners},
     query::{Form, NoQuery, Parameters, attributes},
     regions,
-    registry::{Id, Opened, Reading, no_image},
     results::file_response,
     work::blocking,
 };

@@ -5,10 +5,7 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-use super::{
-    problem::Refusal,
-    registry::{Images, Opened},
-};
+use super::{entry::Opened, problem::Refusal, registry::Images};
 use crate::{
     admission::{AdmissionError, Permit},
     disk::Directory,

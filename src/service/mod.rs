@@ -11,6 +11,7 @@ pub mod auth;
 mod body;
 mod charge;
 mod connection;
+mod entry;
 mod health;
 mod images;
 mod inflate;
@@ -123,6 +124,8 @@ struct Inner {
     spare: Spare,
     /// Memory for requests.
     requests: Budget,
+    /// What requests over HTTP/2 hold while they wait for that; nobody waits for it.
+    ahead: Budget,
     /// Memory for the counts of tiles whose pixels differ in them, while these come: of its own, since who waits for it
     /// holds some of that for requests.
     counts: Budget,
@@ -199,7 +202,7 @@ impl Service {
         let metrics = config.metrics_listen.map(listen).transpose()?;
         let of = |bytes| Budget::new(bytes, config.queue);
         let ([budget, requests, counts, memory], unread) =
-            (charge::shares(config.memory.0).map(of), of(config.unread_results.0));
+            (charge::shares(config.shared_memory()).map(of), of(config.unread_results.0));
         let (images, found) = Images::start(&config, memory).map_err(|error| match error {
             StartError::InUse => ServeError::InUse { path: config.data_dir.clone() },
             StartError::Io(source) => data_dir(source),
@@ -212,6 +215,7 @@ impl Service {
             budget,
             spare,
             requests,
+            ahead: Budget::new(charge::AHEAD, 0),
             counts,
             unread,
             work,

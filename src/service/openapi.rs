@@ -3,7 +3,7 @@
 //! Each call has one entry in [`calls`], from which the router is built too. The schemas are in
 //! `schemas.rs`.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, sync::LazyLock};
 
 use axum::{
     http::header,
@@ -303,7 +303,9 @@ pub(super) fn document() -> String {
 
 /// `GET /openapi.json`.
 async fn serve(_: NoQuery) -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, "application/json")], document())
+    // One for all: who reads it is not asked for memory.
+    static DOCUMENT: LazyLock<String> = LazyLock::new(document);
+    ([(header::CONTENT_TYPE, "application/json")], DOCUMENT.as_str())
 }
 
 #[cfg(test)]

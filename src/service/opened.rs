@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use axum::http::StatusCode;
 
-use super::{Shared, problem::Refusal, regions, registry::Opened};
+use super::{Shared, entry::Opened, problem::Refusal, regions};
 use crate::{
     filter::{ChannelSet, Filtered, Method, SampleTile},
     image::{self, Outcome},
@@ -90,8 +90,8 @@ mod tests {
         filter::{Channel, Method, Rect, Role, TileGeometry},
         image::{Description, Image},
         service::{
+            entry::{Entry, Id, Slot},
             known::Memory,
-            registry::{Entry, Id, Slot},
         },
         wire::{Format, SampleCounts},
     };

@@ -4,10 +4,7 @@
 use std::{
     io::{self, IoSlice},
     pin::Pin,
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicUsize, Ordering},
-    },
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     task::{Context, Poll, ready},
     time::Duration,
 };
@@ -69,27 +66,48 @@ impl Meter {
 }
 
 /// The bodies of a connection's requests that may still be read. As long as there is one the client need not read.
-#[derive(Clone, Debug, Default)]
-pub(super) struct OpenBodies(Arc<AtomicUsize>);
+#[derive(Clone, Debug)]
+pub(super) struct OpenBodies(Arc<Mutex<Bodies>>);
+
+#[derive(Debug)]
+struct Bodies {
+    open: usize,
+    /// When the last of them ended.
+    ended: Instant,
+}
 
 /// One of them, until it is dropped.
 #[derive(Debug)]
 pub(super) struct OpenBody(OpenBodies);
 
+impl Default for OpenBodies {
+    fn default() -> Self {
+        Self(Arc::new(Mutex::new(Bodies { open: 0, ended: Instant::now() })))
+    }
+}
+
 impl OpenBodies {
     pub(super) fn open(&self) -> OpenBody {
-        self.0.fetch_add(1, Ordering::Relaxed);
+        self.lock().open += 1;
         OpenBody(self.clone())
     }
 
-    fn any(&self) -> bool {
-        self.0.load(Ordering::Relaxed) > 0
+    fn lock(&self) -> MutexGuard<'_, Bodies> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// How long it was waited for a client since then, who had nothing left to send.
+    fn waited(&self, since: Instant) -> Duration {
+        let bodies = self.lock();
+        if bodies.open > 0 { Duration::ZERO } else { since.max(bodies.ended).elapsed() }
     }
 }
 
 impl Drop for OpenBody {
     fn drop(&mut self) {
-        self.0.0.fetch_sub(1, Ordering::Relaxed);
+        let mut bodies = self.0.lock();
+        bodies.open -= 1;
+        bodies.ended = Instant::now();
     }
 }
 
@@ -111,9 +129,9 @@ impl<S> Watched<S> {
     /// Judges what a write has come to.
     fn judge(&mut self, context: &mut Context<'_>, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
         let Poll::Pending = written else {
-            let waited = self.stalled.take().map_or(Duration::ZERO, |(since, _)| since.elapsed());
+            let waited = self.stalled.take().map_or(Duration::ZERO, |(since, _)| self.bodies.waited(since));
             let bytes = if let Poll::Ready(Ok(bytes)) = &written { *bytes as u64 } else { 0 };
-            if self.meter.add(waited, bytes).is_err() && !self.bodies.any() {
+            if self.meter.add(waited, bytes).is_err() {
                 return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
             }
             return written;
@@ -122,9 +140,9 @@ impl<S> Watched<S> {
             let left = self.meter.left();
             let (since, timer) = self.stalled.get_or_insert_with(|| (Instant::now(), Box::pin(sleep(left))));
             ready!(timer.as_mut().poll(context));
-            let waited = since.elapsed();
+            let waited = self.bodies.waited(*since);
             self.stalled = None;
-            if self.meter.add(waited, 0).is_err() && !self.bodies.any() {
+            if self.meter.add(waited, 0).is_err() {
                 return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
             }
         }
@@ -184,15 +202,15 @@ impl Taking {
     /// What is still to be waited before the client is judged.
     fn left(&self) -> Duration {
         let left = self.meter.left();
-        self.since.map_or(left, |since| left.saturating_sub(since.elapsed()))
+        self.since.map_or(left, |since| left.saturating_sub(self.bodies.waited(since)))
     }
 
     /// Adds the time waited up to now, if it was; gives the body if that was too long.
     fn judge(&mut self) -> Option<Body> {
         let since = self.since.as_mut()?;
-        let waited = since.elapsed();
-        *since += waited;
-        if self.meter.add(waited, 0).is_err() && !self.bodies.any() { self.body.take() } else { None }
+        let waited = self.bodies.waited(*since);
+        *since = Instant::now();
+        if self.meter.add(waited, 0).is_err() { self.body.take() } else { None }
     }
 }
 
@@ -287,17 +305,22 @@ mod tests {
         runtime.block_on(async {
             let (bodies, idle) = (OpenBodies::default(), Duration::from_millis(50));
             let (near, mut far) = duplex(64);
-            let mut watched = Watched::new(near, Pace { idle, rate: 1000 }, bodies.clone());
+            let mut watched = Watched::new(near, Pace { idle, rate: 10_000 }, bodies.clone());
             let body = bodies.open();
             let reader = async {
                 // Several windows: nothing happens to a client that may still send.
-                sleep(5 * idle).await;
+                sleep(9 * idle / 2).await;
+                let sent = Instant::now();
                 drop(body);
                 let mut read = [0; 64];
                 far.read_exact(&mut read).await.unwrap();
+                sent
             };
-            let (written, ()) = tokio::join!(watched.write_all(&[7; 1000]), reader);
+            let write = async { (watched.write_all(&[7; 1000]).await, Instant::now()) };
+            let ((written, ended), sent) = tokio::join!(write, reader);
             assert_eq!(written.unwrap_err().kind(), io::ErrorKind::TimedOut);
+            // What passed while he sent is not his time to read.
+            assert!(ended - sent >= idle);
         });
     }
 
@@ -315,15 +338,15 @@ mod tests {
             let open = bodies.open();
             let mut taken = Taken::new(Body::from_stream(parts), Pace { idle, rate: 1000 }, bodies);
             let mut next = async || std::future::poll_fn(|context| Pin::new(&mut taken).poll_frame(context)).await;
-            for _ in 0..3 {
-                // Several windows: nothing happens to a client that may still send.
-                sleep(3 * idle).await;
-                assert!(next().await.unwrap().is_ok());
-            }
+            assert!(next().await.unwrap().is_ok());
+            // Several windows: nothing happens to a client that may still send.
+            sleep(9 * idle / 2).await;
+            let sent = Instant::now();
             drop(open);
             while held.strong_count() > 0 {
                 sleep(idle / 10).await;
             }
+            assert!(sent.elapsed() >= idle);
             assert!(next().await.unwrap().is_err());
         });
     }

@@ -17,10 +17,11 @@ use serde_json::Value;
 
 use super::{
     Shared,
+    entry::{Entry, Id, Opened, Slot},
     health::{Reason, recovering},
     problem::Refusal,
     regions,
-    registry::{Entry, Id, Images, Opened, Slot, now, remove},
+    registry::{Images, now, remove},
     work::blocking,
 };
 use crate::{
@@ -30,6 +31,11 @@ use crate::{
 
 /// Recovers what was found in the data folder, one after another, and goes on with what can be filtered.
 pub(super) async fn recover(service: Shared, found: Vec<PathBuf>) {
+    recover_each(service, found, Images::recover).await;
+}
+
+/// Recovers each by `one`, which may panic.
+async fn recover_each(service: Shared, found: Vec<PathBuf>, one: fn(&Images, &Path) -> Option<Opened>) {
     let (began, count) = (Instant::now(), found.len());
     for path in found {
         // It is all there at the next start too.
@@ -37,7 +43,7 @@ pub(super) async fn recover(service: Shared, found: Vec<PathBuf>) {
             return;
         }
         let (shared, place) = (Arc::clone(&service), path.clone());
-        match blocking(move || shared.images.recover(&place)).await {
+        match blocking(move || one(&shared.images, &place)).await {
             Ok(Some(opened)) => regions::kick(&service, &opened),
             Ok(None) => {}
             // One that panics keeps no others from being recovered, and stays as it is.
@@ -130,4 +136,53 @@ fn used(path: &Path) -> u64 {
     use std::os::unix::fs::MetadataExt;
     let files = fs::read_dir(path).into_iter().flatten().flatten();
     files.filter_map(|file| Some(file.metadata().ok()?.blocks() * 512)).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{config::Config, filter::Method, image::Description, service::Service};
+
+    /// Reads an image, unless it is this one.
+    fn one(images: &Images, path: &Path) -> Option<Opened> {
+        assert!(!path.ends_with("bad"), "on purpose");
+        images.recover(path)
+    }
+
+    #[test]
+    fn an_image_whose_recovery_panics_keeps_its_place_and_no_others() {
+        let folder = tempfile::tempdir().unwrap();
+        let description = Description {
+            size: [64, 64],
+            method: Method::default(),
+            seed: 0,
+            leave_out: true,
+            neighbors: None,
+            owner: None,
+            disk: 0,
+        };
+        for id in ["a", "bad", "c"] {
+            let path = folder.path().join("images").join(id);
+            fs::create_dir_all(&path).unwrap();
+            Image::create(&Directory::new(&path), &description).unwrap();
+        }
+        let config = Config { data_dir: folder.path().into(), listen: ([127, 0, 0, 1], 0).into(), ..Config::default() };
+        let Service { mut found, inner, .. } = Service::bind(config).unwrap();
+        found.sort();
+        assert!(inner.readiness.has(Reason::Recovering) && found.len() == 3);
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        runtime.block_on(recover_each(Arc::clone(&inner), found, one));
+        assert!(!inner.readiness.has(Reason::Recovering));
+        let list = inner.images.list();
+        let told = |i: usize| (list[i]["id"].as_str().unwrap(), list[i]["damaged"].is_string());
+        assert_eq!((list.len(), told(0), told(1), told(2)), (3, ("a", false), ("bad", true), ("c", false)));
+        // It is what it was, for whoever looks into it, and nobody opens another one in its place.
+        let bad = || Id::chosen("bad").unwrap();
+        assert_eq!(inner.images.find(&bad()).unwrap_err().0.code, "damaged");
+        let again = inner.images.open(bad(), description, usize::MAX);
+        assert_eq!(again.unwrap_err().0.code, "damaged");
+        assert!(Image::open(Box::new(Directory::new(folder.path().join("images/bad")))).is_ok());
+        // It can be deleted.
+        assert!(inner.images.delete(&bad()).unwrap() && inner.images.count() == 2);
+    }
 }

@@ -13,9 +13,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::{
     Shared,
+    entry::Opened,
     metrics::Phase,
     problem::Refusal,
-    registry::Opened,
     work::{blocking, stopped},
 };
 use crate::{

@@ -7,7 +7,7 @@ use axum::{
     routing::get,
 };
 
-use super::{Shared, auth, body, charge, metrics, openapi, problem::Refusal, recover, trace};
+use super::{Shared, auth, body, charge, health, metrics, openapi, problem::Refusal, recover, trace};
 
 pub(super) fn router(service: Shared) -> Router {
     let charged = from_fn_with_state(service.clone(), charge::charge);
@@ -30,10 +30,12 @@ pub(super) fn router(service: Shared) -> Router {
         .with_state(service)
 }
 
-/// What is served on the address for metrics.
+/// What is served on the address for metrics, which lasts to the very end.
 pub(super) fn metrics_router(service: Shared) -> Router {
     Router::new()
         .route("/metrics", get(metrics::metrics))
+        .route("/livez", get(health::live))
+        .route("/readyz", get(health::ready))
         .fallback(nothing)
         .method_not_allowed_fallback(not_allowed)
         .with_state(service)

@@ -27,12 +27,12 @@ use super::{
     Shared,
     body::Frames,
     charge::{Charge, keep},
+    entry::{Id, Opened},
     metrics::Phase,
     picture::{CorePixels, encode_png, write_file},
     problem::{Refusal, corners, internal},
     query::{Form, Parameters, attributes},
     receive::{Fault, Received, Receiver},
-    registry::{Id, Opened},
     results::{AROUND, Results, file_response},
     work::{blocking, stopped},
 };
@@ -166,6 +166,7 @@ impl Call {
                 Ok("filtered")
             }
             Target::Image { image, replace } => {
+                let mut began = Instant::now();
                 let state = match image.offer(&tile, *replace, &self.service)? {
                     Outcome::Repeated => {
                         held.free(tile, &self.service);
@@ -177,13 +178,15 @@ impl Call {
                     }
                     Outcome::Filter(claim) => {
                         let (Done { filtered, report }, _held) = self.filter(tile, held, pool, stop)?;
-                        let began = Instant::now();
-                        let state = image.add(claim, &filtered, report.seconds)?;
-                        self.service.metrics.phase(Phase::Write, began);
-                        state
+                        began = Instant::now();
+                        image.add(claim, &filtered, report.seconds)?
                     }
                 };
                 image.flush(&self.service)?;
+                if state != "repeated" {
+                    // Until it is durable: that is what takes the time.
+                    self.service.metrics.phase(Phase::Write, began);
+                }
                 let line = json!({ "tile": corners(geometry.core()), "state": state });
                 results.append(Some(unread), |out| writeln!(out, "{line}"))?;
                 Ok(state)

@@ -5,6 +5,7 @@
 //! - [`state`]: records of what is stored, in an embedded store.
 
 mod backing;
+mod blocks;
 mod cut;
 pub mod samples;
 pub mod spool;

@@ -60,7 +60,7 @@ fn a_named_image_is_kept_and_its_tiles_are_not_filtered_twice() {
 
 #[test]
 fn a_tile_that_the_service_has_no_memory_for_exits_with_4() {
-    let (folder, server) = (Folder::new(), Server::start(&["--memory", "2MiB"]));
+    let (folder, server) = (Folder::new(), Server::start(&["--memory", "4MiB", "--threads", "8"]));
     let url = format!("http://{}", server.address);
     let input = data("small.tiles.zst").into_os_string().into_string().unwrap();
     let (code, message) = fails(4, ["post", &input, "--to", &url, "-o", &folder.path("out.exr")]);

@@ -131,7 +131,7 @@ fn room_that_ones_own_tiles_hold_is_waited_for() {
 
 #[test]
 fn failures_that_nobody_reads_have_a_limit() {
-    let server = start(&["--memory", "1MiB"]);
+    let server = start(&["--memory", "4MiB"]);
     // Each is refused, with more words than it has bytes.
     let (first, part) = (plain(16, 1, 0), plain(1024, 1000, 1).repeat(1000));
     let mut stream = server.send("/v1/filter?preset=unfiltered", &[], &first, first.len() + 150 * part.len());
@@ -270,10 +270,10 @@ fn tiles_whose_counts_vary_do_not_wait_for_each_other() {
 
 #[test]
 fn requests_take_memory_too() {
-    // Room for one request at a time.
-    let server = start(&["--memory", "1MiB", "--queue-deadline", "200ms"]);
+    // Room for three requests at a time.
+    let server = start(&["--memory", "4MiB", "--queue-deadline", "200ms"]);
     let body = whole(16);
-    let half = server.begin("/v1/filter", &[], &body[..body.len() / 2], body.len());
+    let half = [(); 3].map(|()| server.begin("/v1/filter", &[], &body[..body.len() / 2], body.len()));
     server.get("/v1/images").problem(503, "busy");
     assert_eq!(server.get("/livez").status, 200);
     drop(half);

@@ -118,8 +118,8 @@ fn requests_at_once_are_bounded() {
 
 /// A frame of a stream.
 fn frame(kind: u8, flags: u8, stream: u8, payload: &[u8]) -> Vec<u8> {
-    let length = u8::try_from(payload.len()).unwrap();
-    [&[0, 0, length, kind, flags, 0, 0, 0, stream][..], payload].concat()
+    let [high, low] = u16::try_from(payload.len()).unwrap().to_be_bytes();
+    [&[0, high, low, kind, flags, 0, 0, 0, stream][..], payload].concat()
 }
 
 /// HEADERS of a whole request without a body.
@@ -247,4 +247,43 @@ fn stopping_ends_what_has_begun() {
     };
     assert_eq!(answer.messages().len(), 2);
     assert_eq!(server.ended().code(), Some(0));
+}
+
+/// What is sent of a request before there is memory for it is in no request's share.
+#[test]
+fn few_requests_wait_for_their_memory() {
+    let server = Server::start(&["--memory", "4MiB", "--threads", "1", "--metrics-listen", "127.0.0.1:0"]);
+    // Room for three requests, who have it for as long as they like.
+    let body = whole(16);
+    let held = [(); 3].map(|()| server.begin("/v1/filter", &[], &body[..body.len() / 2], body.len()));
+    let requests: Vec<u8> = (0..32).flat_map(|i| get(1 + 2 * i, "/v1/images")).collect();
+    let waiting = [(); 5].map(|()| {
+        let mut stream = server.connect();
+        stream.write_all(&[PREFACE, SETTINGS, &requests].concat()).unwrap();
+        stream
+    });
+    // 8 MiB for 64 KiB each, and some for the head.
+    let refused = "rpfd_problems_total{code=\"busy\"}";
+    wait_until("33 of 160 are refused", || server.metric(refused) == Some(33.0));
+    wait_until("the others wait", || server.metric("rpfd_requests_in_flight") == Some(130.0));
+    drop(held);
+    wait_until("all are answered", || server.metric("rpfd_requests_in_flight") == Some(0.0));
+    assert_eq!(server.metric(refused), Some(33.0));
+    drop(waiting);
+}
+
+#[test]
+fn a_head_has_no_more_fields_than_in_http_1() {
+    if !has("curl", "--version") {
+        return;
+    }
+    let server = Server::start(&[]);
+    // With user-agent and accept, that curl sends.
+    let fields: Vec<String> = (0..99).map(|i| format!("x-{i}: 1")).collect();
+    let url = format!("http://{}/livez", server.address);
+    let ask = |fields: &[String]| {
+        let headers = fields.iter().flat_map(|field| ["-H", field]);
+        curl(&headers.chain([url.as_str()]).collect::<Vec<_>>()).0
+    };
+    assert_eq!((ask(&fields[1..]), ask(&fields)), (200, 431));
 }

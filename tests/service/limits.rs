@@ -25,8 +25,8 @@ fn memory(side: u32, method: &Method) -> String {
 
 #[test]
 fn a_tile_that_never_fits_is_told_the_size_that_would() {
-    let server = Server::start(&["--memory", "1MiB"]);
-    let problem = server.post("/v1/filter", &whole(64)).problem(413, "over_memory");
+    let server = Server::start(&["--memory", "4MiB", "--threads", "2"]);
+    let problem = server.post("/v1/filter", &whole(128)).problem(413, "over_memory");
     assert!(problem["needed"].as_u64() > problem["available"].as_u64());
     let fits = problem["fits"][0].as_u64().unwrap() as u32;
     assert!(problem["detail"].as_str().unwrap().contains(&format!("{fits} x {fits}")), "{problem}");

@@ -103,11 +103,16 @@ impl Server {
         Self { child, address: first, metrics, folder: Some(folder) }
     }
 
+    /// What it answers where its metrics are.
+    pub(crate) fn beside(&self, path: &str) -> Answer {
+        let mut stream = TcpStream::connect(self.metrics.as_ref().unwrap()).unwrap();
+        stream.write_all(head("GET", path, &[], 0).as_bytes()).unwrap();
+        Answer::read(&mut stream)
+    }
+
     /// What it counts now.
     pub(crate) fn metrics(&self) -> String {
-        let mut stream = TcpStream::connect(self.metrics.as_ref().unwrap()).unwrap();
-        stream.write_all(head("GET", "/metrics", &[], 0).as_bytes()).unwrap();
-        let answer = Answer::read(&mut stream);
+        let answer = self.beside("/metrics");
         assert_eq!(answer.header("content-type"), Some("application/openmetrics-text; version=1.0.0; charset=utf-8"));
         String::from_utf8(answer.body).unwrap()
     }

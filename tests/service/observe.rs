@@ -63,12 +63,12 @@ fn regions_and_disk_are_counted() {
         ("rpfd_regions_total{outcome=\"filtered\"}", regions),
         ("rpfd_regions_total{outcome=\"failed\"}", 0.0),
         ("rpfd_tiles_total{outcome=\"stored\"}", 2.0),
-        // Tiles and regions wait, and are read; regions alone are filtered.
+        // Tiles and regions wait, are read, and are written; regions alone are filtered.
         ("rpfd_tile_phase_seconds_count{phase=\"queue\"}", 2.0 + regions),
         ("rpfd_tile_phase_seconds_count{phase=\"receive\"}", 2.0 + regions),
         ("rpfd_tile_phase_seconds_count{phase=\"turn\"}", 2.0 + regions),
         ("rpfd_tile_phase_seconds_count{phase=\"filter\"}", regions),
-        ("rpfd_tile_phase_seconds_count{phase=\"write\"}", regions),
+        ("rpfd_tile_phase_seconds_count{phase=\"write\"}", 2.0 + regions),
         ("rpfd_queue_length", 0.0),
     ] {
         super::wait_until(name, || server.metric(name) == Some(value));

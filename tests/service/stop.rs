@@ -15,8 +15,11 @@ fn what_has_begun_ends_while_nothing_new_begins() {
     let mut idle = server.connect();
     idle.write_all(b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\n").unwrap();
     idle.read_exact(&mut [0; 12]).unwrap();
+    assert_eq!((server.beside("/readyz").status, server.beside("/livez").status), (200, 200));
     server.signal("-TERM");
     wait_until("it is draining", || server.metric("rpfd_ready") == Some(0.0));
+    server.beside("/readyz").problem(503, "draining");
+    assert_eq!(server.beside("/livez").status, 200);
     wait_until("nobody is let in", || TcpStream::connect(&server.address).is_err());
     // A connection without a request ends.
     idle.read_to_end(&mut Vec::new()).unwrap();
