@@ -112,6 +112,16 @@ impl Folder for Directory {
     }
 }
 
+/// Makes a folder, and those above it that are not there, and waits until their names are on the disk.
+pub fn make_folders(path: &Path) -> io::Result<()> {
+    let missing: Vec<_> = path.ancestors().take_while(|path| !path.as_os_str().is_empty() && !path.is_dir()).collect();
+    fs::create_dir_all(path)?;
+    missing.into_iter().try_for_each(|made| {
+        let above = made.parent().filter(|above| !above.as_os_str().is_empty());
+        File::open(above.unwrap_or(Path::new(".")))?.sync_all()
+    })
+}
+
 /// Whether an I/O error says that the disk, the quota or the allowed file size is used up.
 pub fn is_full(error: &io::Error) -> bool {
     use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};

@@ -436,6 +436,32 @@ mod tests {
     }
 
     #[test]
+    fn who_is_refused_is_told_when_by_how_fast_others_were_and_how_many_wait() {
+        run(async {
+            let budget = Budget::new(10, 0);
+            let held = budget.reserve(10, LATER).await.unwrap();
+            let refused = async |bytes| match budget.reserve(bytes, LATER).await.unwrap_err() {
+                AdmissionError::Busy { retry_after, .. } => retry_after,
+                other => panic!("{other}"),
+            };
+            assert_eq!(refused(10).await, LATER);
+            std::thread::sleep(SOON);
+            drop(held);
+            let held = budget.reserve(10, LATER).await.unwrap();
+            // Not by the deadline, now that something was given back; half of it takes half the time.
+            let (half, all) = (refused(5).await, refused(10).await);
+            assert!(SOON / 2 <= half && 2 * half <= all + SOON && all < LATER, "{half:?} {all:?}");
+            let own = budget.clone();
+            let ahead = tokio::spawn(async move { own.reserve_own(10).await });
+            yield_now().await;
+            let behind = refused(10).await;
+            assert!(behind >= 2 * all - SOON / 100, "{all:?} {behind:?}");
+            drop(held);
+            assert!(ahead.await.unwrap().is_ok());
+        });
+    }
+
+    #[test]
     fn own_work_waits_its_turn_and_takes_no_place() {
         run(async {
             let budget = Budget::new(10, 1);

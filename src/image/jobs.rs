@@ -224,3 +224,52 @@ fn halves(rect: Rect) -> [Rect; 2] {
         [Rect::new(x, y, width, top), Rect::new(x, y + top, width, height - top)]
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        disk::Directory,
+        filter::{Channel, ChannelSet, Counts, Method, Plane, Role, SampleTile},
+        image::{Announced, disk_bytes},
+    };
+
+    const SIZE: [u32; 2] = [32, 16];
+
+    /// How often a region took the place of what was filtered from a halo that brought this for its neighbour's pixels.
+    fn replaced(around: f32) -> u64 {
+        let channels = ChannelSet::new(vec![Channel::new("color", Role::Color, 3)]).unwrap();
+        let tile = |core: Rect, halo| {
+            let geometry = TileGeometry::with_halo(SIZE, core, halo).unwrap();
+            let window = geometry.window();
+            let pixels = (window.y..window.bottom()).flat_map(|y| (window.x..window.right()).map(move |x| (x, y)));
+            let values: Vec<f32> = pixels.map(|(x, y)| if core.contains(x, y) { 0.5 } else { around }).collect();
+            let planes = vec![Plane::Values(values); 3];
+            SampleTile::new(geometry, channels.clone(), Counts::Uniform(1), planes).unwrap()
+        };
+        let method = Method::preset("gaussian").unwrap();
+        let neighbors = Some(Announced { channels: channels.clone(), samples: 1, varying: false, region: 16 });
+        let mut description =
+            Description { size: SIZE, method, seed: 0, leave_out: true, neighbors, owner: None, disk: 0 };
+        description.disk = disk_bytes(&description);
+        let folder = tempfile::tempdir().unwrap();
+        Image::create(&Directory::new(folder.path()), &description).unwrap();
+        let image = Arc::new(Image::open(Box::new(Directory::new(folder.path()))).unwrap());
+        let mut filtered = Vec::new();
+        for (core, halo) in [(Rect::new(0, 0, 16, 16), 2), (Rect::new(16, 0, 16, 16), 0)] {
+            image.offer(&tile(core, halo), false).unwrap();
+            image.flush().unwrap();
+            while let Some(job) = image.next_job(1, u64::MAX, u64::MAX).unwrap() {
+                image.run(&job, &Execution::default()).unwrap();
+                filtered.push(job.region);
+            }
+        }
+        assert_eq!((&filtered[..], image.read().complete()), (&[0, 0, 1][..], true));
+        image.read().replacements()
+    }
+
+    #[test]
+    fn what_halos_lent_is_filtered_again_only_if_the_cores_differ() {
+        assert_eq!((replaced(0.5), replaced(0.25)), (0, 1));
+    }
+}

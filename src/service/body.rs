@@ -282,6 +282,12 @@ mod tests {
         let two = |log| [packed(20), packed(log)].concat();
         assert_eq!(read(Some("zstd"), two(23).into(), memory, PACE), Ok(b"smallsmall".to_vec()));
         assert_eq!(read(Some("zstd"), two(23).into(), memory - 1, PACE).unwrap_err(), "over_memory");
+        let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        io::Write::write_all(&mut gzip, b"small").unwrap();
+        let gzip = gzip.finish().unwrap();
+        let memory = REQUEST + OVERHEAD;
+        assert_eq!(read(Some("gzip"), gzip.clone().into(), memory, PACE), Ok(b"small".to_vec()));
+        assert_eq!(read(Some("gzip"), gzip.into(), memory - 1, PACE).unwrap_err(), "over_memory");
     }
 
     #[test]

@@ -195,7 +195,7 @@ impl Service {
         config.validate()?;
         let auth = Auth::new(&config)?;
         let data_dir = |source| ServeError::DataDir { path: config.data_dir.clone(), source };
-        std::fs::create_dir_all(&config.data_dir).map_err(data_dir)?;
+        crate::disk::make_folders(&config.data_dir).map_err(data_dir)?;
         tempfile::tempfile_in(&config.data_dir).map_err(data_dir)?;
         let work = Work::new(config.threads, config.work_deadline)?;
         let (listener, address) = listen(config.listen)?;

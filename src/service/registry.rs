@@ -23,7 +23,7 @@ use super::{
 use crate::{
     admission::Budget,
     config::Config,
-    disk::Directory,
+    disk::{Directory, make_folders},
     image::{self, Description, INDEX_STEP, Image, ImageError},
     wire::Problem,
 };
@@ -82,7 +82,7 @@ impl Images {
             Ok(()) => {}
         }
         let folder = config.data_dir.join(IMAGES);
-        fs::create_dir_all(&folder)?;
+        make_folders(&folder)?;
         let found = fs::read_dir(&folder)?.map(|found| Ok(found?.path())).collect::<io::Result<_>>()?;
         let images = Self {
             all: Mutex::default(),

@@ -5,6 +5,7 @@
 mod full;
 mod kill;
 mod power;
+mod synced;
 
 /// How many rounds, and the seed of the first.
 pub(crate) fn rounds(few: u64) -> impl Iterator<Item = u64> {

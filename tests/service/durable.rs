@@ -3,7 +3,11 @@
 use super::{Answer, Server, encode, exact::whole_exr, neighbors, samples, tile, wait_until};
 use rpfd::filter::{Method, Rect};
 use serde_json::json;
-use std::{io::Write, process::Command};
+use std::{
+    io::Write,
+    process::Command,
+    time::{Duration, SystemTime},
+};
 
 const SIZE: [u32; 2] = [32, 16];
 const LEFT: Rect = Rect::new(0, 0, 16, 16);
@@ -188,7 +192,7 @@ fn images_that_nobody_uses_leave_the_memory_and_come_back() {
 #[test]
 fn images_that_nobody_uses_expire() {
     let server = Server::start(&["--image-ttl", "1"]);
-    let seconds = || std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap().as_secs();
+    let seconds = || SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap().as_secs();
     let (before, opened) = (seconds(), server.post("/v1/images", br#"{"width": 32, "height": 16, "id": "a"}"#));
     let (expires, after) = (opened.json()["expires"].as_u64().unwrap(), seconds());
     assert!(expires > before && expires <= after + 1, "{before} {expires} {after}");
@@ -197,6 +201,33 @@ fn images_that_nobody_uses_expire() {
     server.get("/v1/images/a").problem(404, "unknown_image");
     // It is forgotten first, and its files are removed then.
     wait_until("its files to be gone", || std::fs::read_dir(server.data_dir().join("images")).unwrap().count() == 0);
+}
+
+#[test]
+fn the_last_use_is_known_after_a_new_start() {
+    const HOUR: Duration = Duration::from_secs(3600);
+    let arguments = ["--image-ttl", "1d", "--image-idle", "100ms"];
+    let server = Server::start(&arguments);
+    open(&server, "old");
+    open(&server, "used");
+    let folder = server.kill();
+    let images = folder.path().join("images");
+    let now = SystemTime::now();
+    for (id, hours) in [("old", 25), ("used", 23)] {
+        let file = std::fs::File::create(images.join(id).join("touched")).unwrap();
+        file.set_modified(now - hours * HOUR).unwrap();
+    }
+    let server = Server::start_in(folder, &arguments);
+    wait_until("the old one to expire", || !images.join("old").exists());
+    let expires = |server: &Server| server.get("/v1/images").json()["images"][0]["expires"].as_u64().unwrap();
+    let seconds = |time: SystemTime| time.duration_since(SystemTime::UNIX_EPOCH).unwrap().as_secs();
+    assert_eq!(expires(&server), seconds(now + HOUR));
+    // Each use counts, also for those who come later.
+    assert_eq!(server.get("/v1/images/used").status, 200);
+    let later = expires(&server);
+    assert!(later >= seconds(now + 24 * HOUR), "{later}");
+    let server = Server::start_in(server.kill(), &arguments);
+    assert_eq!(expires(&server), later);
 }
 
 #[test]

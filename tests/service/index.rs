@@ -73,6 +73,30 @@ fn tiles_that_there_is_no_memory_to_know_of_are_refused() {
     assert_eq!(server.get("/v1/images/a").json()["tiles_done"], json!(stored.len()));
 }
 
+/// So is what answers about images take.
+#[test]
+fn what_is_told_of_images_is_reserved() {
+    // Room for three requests, or for one and a list of 64.
+    let server = Server::start(&["--memory", "4MiB", "--threads", "1"]);
+    assert_eq!(open(&server, "0").status, 201);
+    let tile = plain(Rect::new(0, 0, 64, 64));
+    let lines = server.post("/v1/images/0/tiles", &tile).lines();
+    assert_eq!(lines[0]["state"], "filtered");
+    let asked = ["/v1/images/0", "/v1/images/0/preview.png?partial=true", "/v1/images"];
+    let held = [(); 2].map(|()| server.begin("/v1/filter", &[], &tile[..8], tile.len()));
+    for path in asked {
+        let busy = server.get(path);
+        busy.problem(503, "busy");
+        assert!(busy.header("retry-after").is_some(), "{path}");
+    }
+    drop(held);
+    for path in asked {
+        super::wait_until("room for an answer", || server.get(path).status == 200);
+    }
+    (1..=64).for_each(|id| super::wait_until("room for another", || open(&server, &id.to_string()).status < 300));
+    server.get("/v1/images").problem(413, "over_memory");
+}
+
 /// What JSON grows to when it is read is reserved: a small text may come to much.
 #[test]
 fn what_an_opening_takes_is_reserved() {

@@ -1,6 +1,6 @@
 //! Memory is bounded, and given back.
 
-use super::{Answer, Server, head, samples, tile, wait_until, whole};
+use super::{Answer, Server, flow::plain, head, samples, tile, wait_until, whole};
 use rpfd::{
     config::Config,
     filter::{Channel, ChannelSet, Method, Rect, Role, TileGeometry, plan::plan},
@@ -133,6 +133,12 @@ fn an_idle_body_is_given_up() {
     stream.write_all(head("POST", "/v1/filter", &[], body.len()).as_bytes()).unwrap();
     stream.write_all(&body[..100]).unwrap();
     Answer::read(&mut stream).problem(408, "body_timeout");
+    // Between tiles too; what came before is done.
+    let body = plain(16, 1, 0);
+    let mut stream = server.send("/v1/filter", &[], &body, body.len() + 100);
+    let messages = Answer::read(&mut stream).messages();
+    let Message::Error { problem, .. } = &messages[1] else { panic!("{messages:?}") };
+    assert_eq!((&*problem.code, messages.last()), ("body_timeout", Some(&Message::End { tiles: 1, errors: 1 })));
 }
 
 #[test]
@@ -154,6 +160,28 @@ fn heads_have_a_limit() {
     assert_eq!(ask(&(long(65_536) + "xxxx")), 431);
     assert_eq!(ask(&(fields(100) + "\r\n")), 200);
     assert_eq!(ask(&(fields(101) + "\r\n")), 431);
+}
+
+#[test]
+fn connections_at_once_are_bounded() {
+    let server = Server::start(&["--connections", "1"]);
+    let mut first = server.connect();
+    let mut ask = || {
+        first.write_all(b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\n").unwrap();
+        let mut answer = [0; 4096];
+        let length = std::io::Read::read(&mut first, &mut answer).unwrap();
+        assert!(answer[..length].starts_with(b"HTTP/1.1 200"), "{:?}", String::from_utf8_lossy(&answer[..length]));
+    };
+    ask();
+    let mut second = server.connect();
+    second.write_all(head("GET", "/livez", &[], 0).as_bytes()).unwrap();
+    // However long the first one takes.
+    (0..200).for_each(|_| ask());
+    second.set_nonblocking(true).unwrap();
+    assert_eq!(second.peek(&mut [0]).unwrap_err().kind(), std::io::ErrorKind::WouldBlock);
+    second.set_nonblocking(false).unwrap();
+    drop(first);
+    assert_eq!(Answer::read(&mut second).status, 200);
 }
 
 #[test]
