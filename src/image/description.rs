@@ -41,6 +41,12 @@ pub struct Announced {
 }
 
 impl Description {
+    /// An image of which nothing else is said, for tests.
+    #[cfg(test)]
+    pub(crate) fn plain(size: [u32; 2], method: Method) -> Self {
+        Self { size, method, seed: 0, leave_out: true, neighbors: None, owner: None, disk: 0 }
+    }
+
     /// Whether another one asks for the same image. How large its regions are, what it takes, and whose it is, is the
     /// service's.
     pub fn same(&self, other: &Self) -> bool {

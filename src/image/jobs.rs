@@ -249,8 +249,7 @@ mod tests {
         };
         let method = Method::preset("gaussian").unwrap();
         let neighbors = Some(Announced { channels: channels.clone(), samples: 1, varying: false, region: 16 });
-        let mut description =
-            Description { size: SIZE, method, seed: 0, leave_out: true, neighbors, owner: None, disk: 0 };
+        let mut description = Description { neighbors, ..Description::plain(SIZE, method) };
         description.disk = disk_bytes(&description);
         let folder = tempfile::tempdir().unwrap();
         Image::create(&Directory::new(folder.path()), &description).unwrap();

@@ -66,8 +66,7 @@ mod tests {
         let announced = Announced { channels, samples: 3, varying: true, region: 64 };
         let method = Method::preset("lean").unwrap();
         let neighbors = Some(announced.clone());
-        let description =
-            Description { size: [1024, 768], method, seed: 0, leave_out: true, neighbors, owner: None, disk: 0 };
+        let description = Description { neighbors, ..Description::plain([1024, 768], method) };
         let description = Description { disk: disk_bytes(&description), ..description };
         let mut room = Room::new(&description, &announced);
         let (most, pixels) = (most_cores(description.size), 1024 * 768);

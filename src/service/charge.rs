@@ -207,9 +207,7 @@ mod tests {
             assert!(needed <= tiles, "{threads} threads: {needed} of {tiles} bytes");
             assert!(3 * REQUEST <= requests);
             let neighbors = Announced { channels: channels.clone(), samples: 1, varying: false, region: 16 };
-            let (method, owner) = (method.clone(), None);
-            let (seed, leave_out, neighbors, disk) = (0, true, Some(neighbors), 0);
-            let description = Description { size, method, seed, leave_out, neighbors, owner, disk };
+            let description = Description { neighbors: Some(neighbors), ..Description::plain(size, method.clone()) };
             assert!(description.index_bytes() + INDEX_STEP <= images);
         }
         assert_eq!(shares(Config::default().memory.0).iter().sum::<u64>(), Config::default().memory.0);

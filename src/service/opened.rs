@@ -101,15 +101,7 @@ mod tests {
     #[test]
     fn a_header_is_judged_while_others_hold_the_image() {
         let folder = tempfile::tempdir().unwrap();
-        let description = Description {
-            size: [64, 64],
-            method: Method::default(),
-            seed: 0,
-            leave_out: true,
-            neighbors: None,
-            owner: None,
-            disk: 0,
-        };
+        let description = Description::plain([64, 64], Method::default());
         Image::create(&Directory::new(folder.path()), &description).unwrap();
         let image = Arc::new(Image::open(Box::new(Directory::new(folder.path()))).unwrap());
         let entry = Arc::new(Entry::new(Id::new(), None, 0, 0, Slot::Gone));

@@ -152,15 +152,7 @@ mod tests {
     #[test]
     fn an_image_whose_recovery_panics_keeps_its_place_and_no_others() {
         let folder = tempfile::tempdir().unwrap();
-        let description = Description {
-            size: [64, 64],
-            method: Method::default(),
-            seed: 0,
-            leave_out: true,
-            neighbors: None,
-            owner: None,
-            disk: 0,
-        };
+        let description = Description::plain([64, 64], Method::default());
         for id in ["a", "bad", "c"] {
             let path = folder.path().join("images").join(id);
             fs::create_dir_all(&path).unwrap();
